@@ -42,7 +42,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.geometry import as_array, as_points, as_vector, cross
+from loam_gtsam.geometry import as_array, as_points, as_unit, as_vector, cross
 from loam_gtsam.types import BoolArray, FloatArray, InputError, check_array
 
 _RIDGE = 1e-9
@@ -272,7 +272,7 @@ def point_to_plane_factor(
     InputError
         If a shape is wrong, a value not finite, or the normal not of unit length.
     """
-    p, n = as_vector(point, "point"), _unit(normal, "normal")
+    p, n = as_vector(point, "point"), as_unit(normal, "normal")
     if not np.isfinite(offset):
         raise InputError(f"offset: expected a finite number, got {offset}")
     noise_dimension(noise, 1)
@@ -301,7 +301,11 @@ def point_to_line_factor(
     InputError
         As :func:`point_to_plane_factor` does.
     """
-    p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
+    p, c, u = (
+        as_vector(point, "point"),
+        as_vector(centre, "centre"),
+        as_unit(direction, "direction"),
+    )
     noise_dimension(noise, 2)
     return _pose_factor(key, noise, partial(point_to_line_residual, point=p, centre=c, direction=u))
 
@@ -409,14 +413,6 @@ def _dimension(values: gtsam.Values, key: int) -> int:
     except RuntimeError:  # another type: looked up among all variables, which takes longer
         return int(values.zeroVectors().at(key).size)
     return 6
-
-
-def _unit(value: ArrayLike, name: str) -> FloatArray:
-    vector = as_vector(value, name)
-    length = float(np.linalg.norm(vector))
-    if abs(length - 1.0) > 1e-6:
-        raise InputError(f"{name}: expected unit length, got length {length:.6g}")
-    return vector
 
 
 def noise_dimension(noise: gtsam.noiseModel.Base, dimension: int | None = None) -> int:

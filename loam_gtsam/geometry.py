@@ -55,6 +55,15 @@ def as_vector(value: ArrayLike, name: str, size: int = 3) -> FloatArray:
     return as_array(value, name, (size,))
 
 
+def as_unit(value: ArrayLike, name: str) -> FloatArray:
+    """(3,) of unit length, checked as by :func:`as_array`."""
+    vector = as_vector(value, name)
+    length = float(np.linalg.norm(vector))
+    if abs(length - 1.0) > 1e-6:
+        raise InputError(f"{name}: expected unit length, got length {length:.6g}")
+    return vector
+
+
 def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:
     """Apply a (4, 4) rigid transform to (N, 3) points."""
     moved: FloatArray = points @ a_T_b[:3, :3].T

@@ -33,7 +33,7 @@ from loam_gtsam.factors import (
     point_to_plane_residual,
     scan_match_residual,
 )
-from loam_gtsam.geometry import as_array, as_points, as_vector, checked_pose
+from loam_gtsam.geometry import as_array, as_points, as_unit, as_vector, checked_pose
 from loam_gtsam.types import FloatArray, InputError
 
 OfPose = Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]
@@ -59,7 +59,7 @@ def point_to_plane_between_factor(
         If a shape is wrong, a value not finite, the normal not of unit length, or both keys the
         same.
     """
-    p, n = as_vector(point, "point"), _unit(normal, "normal")
+    p, n = as_vector(point, "point"), as_unit(normal, "normal")
     if not np.isfinite(offset):
         raise InputError(f"offset: expected a finite number, got {offset}")
     residual = partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
@@ -83,7 +83,11 @@ def point_to_line_between_factor(
     InputError
         As :func:`point_to_plane_between_factor` does.
     """
-    p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
+    p, c, u = (
+        as_vector(point, "point"),
+        as_vector(centre, "centre"),
+        as_unit(direction, "direction"),
+    )
     residual = partial(point_to_line_residual, point=p, centre=c, direction=u)
     return _between(target, source, noise, 2, residual)
 
@@ -165,11 +169,3 @@ def _between(
         return error, [-by_source @ motion.inverse().AdjointMap(), by_source]
 
     return checked_factor(noise, [target, source], at)
-
-
-def _unit(value: ArrayLike, name: str) -> FloatArray:
-    vector = as_vector(value, name)
-    length = float(np.linalg.norm(vector))
-    if abs(length - 1.0) > 1e-6:
-        raise InputError(f"{name}: expected unit length, got length {length:.6g}")
-    return vector

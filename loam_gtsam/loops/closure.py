@@ -23,8 +23,9 @@ from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.degeneracy import localizability
-from loam_gtsam.registration.matches import ScanMatches, subset, trial_matching
+from loam_gtsam.registration.matches import ScanMatches, trial_matching
 from loam_gtsam.registration.relocalization import Field, Fit, likely_poses, sample_features
+from loam_gtsam.registration.relocalization.fits import standing_fit
 from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
 from loam_gtsam.registration.solvers.scan_error import scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround
@@ -32,8 +33,7 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
 _STARTS = 3  # number of poses from the search around a candidate at which a trial starts
-
-_LEVEL = 0.7  # cosine between normal and up above which a plane is level; slopes are
+_LEVEL = gtsam.Pose3()  # a lidar that stands upright in the frame of a place, which is level
 
 
 class LoopCloser(Protocol):
@@ -145,7 +145,7 @@ class Verifier:
 
         def fit(found: Solution) -> Fit:
             offered = _offered(len(edges), len(planes), matching)
-            return _standing_fit(found.matches, offered) if found.solved else Fit(0.0, 0.0)
+            return standing_fit(found.matches, offered, _LEVEL) if found.solved else Fit(0.0, 0.0)
 
         solution = self._solver.solve(matches_at, known)
         if self._judged(fit(solution), usual) is not None:
@@ -177,7 +177,7 @@ class Verifier:
         """Share of features off level ground that have a match in the maps as they are."""
         matches = associate(edges, planes, gtsam.Pose3(), *maps, self._whole.matching)
         offered = _offered(len(edges), len(planes), self._whole.matching)
-        return _standing_fit(matches, offered).share
+        return standing_fit(matches, offered, _LEVEL).share
 
     def _judged(self, fit: Fit, usual: float) -> Rejection | None:
         """The reason to reject a registration; None if it is believed."""
@@ -370,14 +370,6 @@ def _usual_share(keyframe: Keyframe, config: MatchingConfig) -> float:
     offered = _offered(update.n_edges, update.n_planes, config)
     matched = update.n_edge_matches + update.n_plane_matches
     return min(matched / offered, 1.0) if offered and matched else 1.0
-
-
-def _standing_fit(matches: ScanMatches, offered: int) -> Fit:
-    """Fit of edges and of planes that are not level, of so many features in a level frame."""
-    # Level ground fits at any heading: with much of it, most matches of a wrong registration agree.
-    standing = np.abs(matches.planes.normals[:, 2]) < _LEVEL
-    level = int(np.count_nonzero(~standing))
-    return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
 
 
 def _odometry_distance(

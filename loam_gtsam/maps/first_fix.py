@@ -22,7 +22,6 @@ from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
-from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import (
     Field,
     Fit,
@@ -33,7 +32,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
 )
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
-from loam_gtsam.registration.relocalization.fits import AS_WELL
+from loam_gtsam.registration.relocalization.fits import AS_WELL, standing_fit
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import trial_solver
 from loam_gtsam.types import FloatArray
@@ -45,7 +44,6 @@ _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
 _AROUND = 6  # number of places around one where a lidar is said to be
 _FIELDS = 18  # that are kept, of the places that were tried last
-_LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,14 +202,3 @@ class PlaceSearch:
 def _at(pose: gtsam.Pose3, found: list[Candidate]) -> Candidate | None:
     """What was found at a pose."""
     return next((c for c in found if same_optimum(c.map_T_middle, pose)), None)
-
-
-def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -> Fit:
-    """Fit of edges and of planes that are not level, of so many features.
-
-    Level ground fits at any heading. Up is that of the lidar: a map need not have one.
-    """
-    up = map_T_lidar.rotation().matrix()[:, 2]
-    standing = np.abs(matches.planes.normals @ up) < _LEVEL
-    level = int(np.count_nonzero(~standing))
-    return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)

@@ -11,12 +11,12 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.loops.keyframes import surely_placed
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, standing_fit
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.matches import trial_matching
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.relocalization import Fit, distinct, same, same_optimum
-from loam_gtsam.registration.relocalization.fits import APART, AS_WELL
+from loam_gtsam.registration.relocalization.fits import APART, AS_WELL, standing_fit
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
 _TURNED, _MOVED = slice(3), slice(3, 6)

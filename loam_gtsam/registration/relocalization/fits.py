@@ -16,7 +16,7 @@ import numpy as np
 
 from loam_gtsam.config import RelocalizationConfig
 from loam_gtsam.geometry import MAD_TO_SIGMA
-from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.types import BoolArray, FloatArray
 
 AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
@@ -28,6 +28,7 @@ AS_WELL = 0.75
 matches, half of which agree, three standard deviations."""
 _OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
+_LEVEL = 0.7  # cosine between normal and up above which a plane is level; slopes are
 _Item = TypeVar("_Item")
 
 
@@ -72,6 +73,18 @@ def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
     lines: BoolArray = edges.distances < AGREE * edges.sigmas
     surfaces: BoolArray = np.abs(planes.distances) < AGREE * planes.sigmas
     return lines, surfaces
+
+
+def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -> Fit:
+    """Fit of edges and of planes that are not level, of so many features.
+
+    Level ground fits at any heading: with much of it, most matches of a wrong pose agree. Up is
+    that of the lidar, for a map need not have one.
+    """
+    up = map_T_lidar.rotation().matrix()[:, 2]
+    standing = np.abs(matches.planes.normals @ up) < _LEVEL
+    level = int(np.count_nonzero(~standing))
+    return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
 
 
 def same(one: gtsam.Pose3, other: gtsam.Pose3, apart: tuple[float, float] = APART) -> bool:

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import json
+import logging
 import os
 import signal
 
@@ -142,10 +143,11 @@ def test_a_folder_is_used_by_one_run_at_a_time_and_free_when_that_was_killed(tmp
         pass
 
 
-def test_where_folders_cannot_be_locked_there_is_no_lock(tmp_path, monkeypatch):
+def test_where_folders_cannot_be_locked_there_is_no_lock(tmp_path, monkeypatch, caplog):
     def flock(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with used_alone(tmp_path), used_alone(tmp_path):
-        pass
+    with caplog.at_level(logging.INFO), used_alone(tmp_path), used_alone(tmp_path):
+        assert caplog.text.count("cannot be locked: [Errno") == 2
+    assert list(tmp_path.iterdir()) == []

@@ -127,11 +127,9 @@ class PoseGraph(FactorGraph):
         If ``pose_graph.visits`` keyframes have come back to a place, the one after it hangs on that
         with which it closed a loop. Returns the number of the first one there if so, else None.
         """
-        if not self.keyframes:
-            return None
-        newest, most = self.keyframes[-1], self.config.visits
-        place = _place(self, newest)
-        return place if place is not None and self.visits.add(newest.index, place, most) else None
+        place, most = _place(self), self.config.visits
+        is_full = place is not None and self.visits.add(self.keyframes[-1].index, place, most)
+        return place if is_full else None
 
     @property
     def forgotten(self) -> Sequence[Forgotten]:
@@ -361,9 +359,12 @@ def _drifts(
     return np.interp(stamps, at, sizes), np.interp(others, at, sizes)
 
 
-def _place(graph: PoseGraph, newest: Keyframe) -> int | None:
+def _place(graph: PoseGraph) -> int | None:
     """The first keyframe of the place at which the newest one surely is; None if it is new."""
-    config, pose = graph.config, graph.pose(newest.index)
+    if not graph.keyframes:
+        return None
+    newest, config = graph.keyframes[-1], graph.config
+    pose = graph.pose(newest.index)
     near = [
         (graph.pose(other.index).range(pose), other.index)
         for other in graph.keyframes[:-1]

@@ -137,7 +137,7 @@ def test_archive_that_cannot_be_written_is_counted(
 
 
 def test_a_cube_that_is_dropped_while_the_archive_is_read_is_skipped() -> None:
-    archive = Archive(grid_of(SMALL, 0.5), 50e-6, None)  # room for two points
+    archive = Archive(grid_of(SMALL, 0.5), 70e-6, None)  # room for two points
     one, two = (CubePoints(np.zeros((n, 3)), tags_of(n, 0)) for n in (1, 2))
     archive.store((0, 0, 0), one)
     archive.store((1, 0, 0), one)

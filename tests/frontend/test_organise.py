@@ -348,7 +348,7 @@ def test_points_in_firing_order_show_where_a_sweep_begins(
 
 def test_sweep_that_overlaps_its_start_keeps_its_order() -> None:
     points, rings, fraction = firing(VLP16, start_deg=187.0, turn=1.04)
-    sweep = organise(Scan(points, 0, rings=rings), Config())
+    sweep = organise(Scan(points, 0, rings=rings), sensor(start_azimuth_deg=180.0))
     expected = 0.1 * (fraction[sweep.index] - 7.0 / 360.0)
     assert expected.min() < 0.0 < 0.1 < expected.max()
     assert sweep.times == pytest.approx(expected, abs=1e-6)

@@ -54,9 +54,9 @@ class Two:
 @pytest.fixture(scope="module")
 def two(tmp_path_factory) -> Two:
     """Two drives through the same rooms, the second one of which begins on the way."""
-    scene, folder = BUILDERS["rooms"](1), tmp_path_factory.mktemp("two")
+    scene, folder = BUILDERS["rooms"](4), tmp_path_factory.mktemp("two")
     config = Config().changed("pose_graph.keyframe_distance=0.5")
-    drives = [SimulatedWorld(scene, frames=60, columns=300, speed=3.0, seed=s) for s in (1, 101)]
+    drives = [SimulatedWorld(scene, frames=60, columns=300, speed=3.0, seed=s) for s in (4, 104)]
     runs, points, maps = [], [], []
     for number, (drive, (start, end)) in enumerate(zip(drives, CUTS, strict=True)):
         part = PartOf(drive, start, 1)

@@ -173,7 +173,9 @@ def _in_order(section: type[Section], values: dict[str, Any]) -> dict[str, Any]:
 def _value(field: FieldInfo) -> st.SearchStrategy[Any]:
     if isinstance(field.default, tuple):
         return st.tuples(*map(st.from_type, get_args(field.annotation)))
-    return st.from_type(Annotated[field.annotation, *field.metadata, ""])  # type: ignore[misc]
+    kinds = get_args(field.annotation) if field.default is None else ()
+    one = next((kind for kind in kinds if kind is not type(None)), field.annotation)
+    return st.from_type(Annotated[one, *field.metadata, ""])  # type: ignore[misc]
 
 
 Step = tuple[str, float, int, int]

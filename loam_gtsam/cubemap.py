@@ -69,7 +69,7 @@ def grid_of(config: MapConfig, voxel_size: float) -> Grid:
     return Grid(config.cube_size, float(voxel_size), oblique=config.insertion == "settled")
 
 
-def _nothing(grid: Grid, config: MapConfig) -> Archive:
+def _empty_archive(grid: Grid, config: MapConfig) -> Archive:
     return Archive(grid, config.archive_megabytes, config.archive_dir)
 
 
@@ -99,7 +99,7 @@ class CubeMap:
         self._grid = grid_of(config, voxel_size)
         self._window = Window.around((0, 0, 0), config.window)
         self._trees = TreeCache()
-        self._archive = _nothing(self._grid, config) if archive is None else archive
+        self._archive = _empty_archive(self._grid, config) if archive is None else archive
         inside = self._window.choose(self._archive.indices())
         self._cubes = {index: self._archive.take(index) or Cube() for index in inside}
         self.owner = 0

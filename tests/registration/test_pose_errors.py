@@ -494,6 +494,20 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     assert np.abs(relative_covariance(after, later)).max() < 0.1
 
 
+def test_a_guess_that_led_elsewhere_is_no_error_of_the_map(monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors = PoseErrors(Config())
+    before = [calibrated(errors, k) for k in range(6)][-1]
+    posed = PosedSweep(SimpleNamespace(stamp=before.stamp + 2 * FRAME), np.zeros(6))
+    away = gtsam.Pose3(gtsam.Rot3(), [60.0, 0.0, 0.0])
+    expected = SimpleNamespace(map_T_middle=away, posed=posed, inertial=None)
+    found = gtsam.Pose3(gtsam.Rot3(), [0.02, 0.0, 0.0])  # where the last motion leads
+    errors.jumped(expected, replace(posed, twist=np.ones(6)), found, unlike=False)
+    added = calibrated(errors, 7, found).uncertainty.drift - before.uncertainty.drift
+    assert 0.01 < np.sqrt(added[3, 3]) < 0.1
+
+
 @pytest.mark.parametrize("unlike", [False, True])
 def test_an_imu_tells_what_may_have_happened_unless_the_pose_contradicts_it(unlike, monkeypatch):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)

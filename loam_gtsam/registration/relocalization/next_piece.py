@@ -49,6 +49,10 @@ class Gap:
         likely = np.maximum(_USUAL**2 * usual, np.repeat(_LIKELY, 3) ** 2)
         return cls(found.middle_stamp, found.map_T_middle, found.twist, likely)
 
+    def steady(self, stamp: int) -> gtsam.Pose3:
+        """The pose at the velocity before the gap."""
+        return self.map_T_lidar.expmap((stamp - self.stamp) * 1e-9 * self.twist)
+
     def bridged(
         self, stamp: int, twist: FloatArray, turned: gtsam.Rot3 | None = None
     ) -> tuple[gtsam.Pose3, FloatArray]:

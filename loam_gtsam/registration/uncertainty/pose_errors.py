@@ -205,17 +205,20 @@ class PoseErrors:
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
         If no usual acceleration leads there, it may only look alike. An IMU to which it is
-        ``unlike`` knew better. A sweep that is ``posed`` with the expected motion was hardly taken
-        in that.
+        ``unlike`` knew better; a user's guess that led away from it did not. A sweep that is
+        ``posed`` with the expected motion was hardly taken in that.
         """
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
-        step = before.localCoordinates(pose)
+        step, gap = before.localCoordinates(pose), self.gap
         if unlike or not (same(before, pose) or self._motion.explains(step, now)):
             missed, inertial = np.zeros((6, 6)), None if unlike else expected.inertial
             if inertial is not None:
                 missed = inertial.covariance_in_map
-            elif (gap := self.gap) is not None:
+            elif gap is not None:
                 missed = gap.bridged(now, posed.twist)[1]
+                if expected.inertial is None:
+                    steady = gap.steady(now).localCoordinates(pose)
+                    step = min(step, steady, key=lambda way: float(np.linalg.norm(way[3:])))
             self._map.add_jump(pose, step, missed)
         elif np.array_equal(posed.twist, expected.posed.twist):
             self._own.stray(step)

@@ -250,9 +250,12 @@ class TightCoupling:
             gravity = level.down(self.config.gravity)
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
-                if not self._rejected:  # but samples were missing, or absurd
-                    velocity, spread = self._gone_on(stamp, velocity, spread)
-                self._odometry.restart(stamp, pose, velocity, spread)
+                # If the prediction was taken back, that pose may have jumped, or the IMU be wrong:
+                # the velocity may be either. Else samples were missing, or absurd.
+                away = (velocity - self._odometry.state.velocity) * self._rejected
+                doubt = np.outer(away, away)
+                velocity, spread = self._gone_on(stamp, velocity, spread + doubt)
+                self._odometry.restart(stamp, pose, velocity, spread + doubt)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
                 sigmas = StartSigmas(gravity=_UNFELT / self.config.gravity) if level.felt else None
                 self._odometry = InertialOdometry(

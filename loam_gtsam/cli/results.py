@@ -159,8 +159,11 @@ def _without_fit(run: RunResult, truth: Trajectory) -> dict[str, float]:
         if run.loops is None:
             nees = evaluation.nees(run.updates, truth)
             ok = [n for n in nees.beyond if run.updates[n].status is FrameStatus.OK]
-            found |= {"nees": nees.mean, "ok_beyond_five_sigma": len(ok)}
-            found |= {"broken_covariances": nees.broken}
+            found |= {
+                "nees": nees.mean,
+                "ok_beyond_five_sigma": len(ok),
+                "broken_covariances": nees.broken,
+            }
     return found
 
 

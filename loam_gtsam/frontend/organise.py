@@ -44,6 +44,7 @@ _MAX_OFFSET = 10.0
 """Seconds: largest distance of a sweep from its stamp, beyond which its pose is extrapolated."""
 _MAX_OUTLIERS = 0.01
 """Largest fraction of points with implausible times that are dropped without an error."""
+_Angles = NDArray[np.float32]  # rad
 _ONE_WAY = 0.8
 """Least fraction of azimuth steps with the same sign that shows the sense of rotation."""
 _ALL_AROUND = 0.98 * 2.0 * np.pi  # rad
@@ -87,9 +88,9 @@ class SweepColumns:
         return len(self.index)
 
     @cached_property
-    def azimuth(self) -> NDArray[np.float32]:
+    def azimuth(self) -> _Angles:
         """(N,) radians from x towards y."""
-        azimuth: NDArray[np.float32] = np.arctan2(self.xyz[1], self.xyz[0])
+        azimuth: _Angles = np.arctan2(self.xyz[1], self.xyz[0])
         return azimuth
 
 
@@ -345,11 +346,14 @@ def _times_from_azimuth(
     order = slice(None) if rings.ring_major else np.argsort(rings.rings, kind="stable")
     number = rings.rings[order]
     same_ring = number[1:] == number[:-1]
-    clockwise, in_order, why = _sense(columns.azimuth[order], same_ring, rings, sensor)
+    azimuth = columns.azimuth[order]
+    steps = azimuth_steps(azimuth) * same_ring  # none from one ring to the next
+    clockwise, in_order, why = _sense(steps, rings, sensor)
     sign = -1.0 if clockwise else 1.0
-    start = None if sensor.start_azimuth_deg is None else np.deg2rad(sensor.start_azimuth_deg)
-    if start is None:
-        start = _beginning(columns.azimuth[order], same_ring) if in_order else np.pi
+    if sensor.start_azimuth_deg is not None:
+        start = float(np.deg2rad(sensor.start_azimuth_deg))
+    else:
+        start = _beginning(azimuth, steps, same_ring) if in_order else np.pi
     turned = columns.azimuth * np.float32(sign / (2.0 * np.pi)) - sign * start / (2.0 * np.pi)
     fraction = (turned - np.floor(turned)).astype(np.float64)
     if in_order:
@@ -364,12 +368,9 @@ def _times_from_azimuth(
     return TimeAssignment((fraction + offset) * sensor.period, span, "azimuth", note)
 
 
-def _sense(
-    azimuth: NDArray[np.float32], same_ring: BoolArray, rings: RingAssignment, sensor: SensorConfig
-) -> tuple[bool, bool, str]:
+def _sense(steps: _Angles, rings: RingAssignment, sensor: SensorConfig) -> tuple[bool, bool, str]:
     """Whether the sensor turns clockwise, whether points are in firing order, and the reason."""
-    step = azimuth_steps(azimuth)[same_ring]
-    back, forth = int(np.count_nonzero(step < 0.0)), int(np.count_nonzero(step > 0.0))
+    back, forth = int(np.count_nonzero(steps < 0.0)), int(np.count_nonzero(steps > 0.0))
     one_way = max(back, forth) >= _ONE_WAY * max(back + forth, 1) and back + forth > 0
     # A file stored ring after ring shows the order of the writer, not of the sensor: KITTI's raw
     # sweeps ascend in azimuth although the scanner turned clockwise.
@@ -388,9 +389,9 @@ def _sense(
     )
 
 
-def _beginning(azimuth: NDArray[np.float32], same_ring: BoolArray) -> float:
+def _beginning(azimuth: _Angles, steps: _Angles, same_ring: BoolArray) -> float:
     """Azimuth, rad, at which rings begin that go all around; that of Velodyne if none does."""
-    turned = np.concatenate(([0.0], np.cumsum(azimuth_steps(azimuth) * same_ring, dtype=float)))
+    turned = np.concatenate(([0.0], np.cumsum(steps, dtype=float)))
     first = run_starts(~same_ring)
     after = np.append(first[1:], len(azimuth))
     whole = first[np.abs(turned[after - 1] - turned[first]) >= _ALL_AROUND]

@@ -250,12 +250,8 @@ class TightCoupling:
             gravity = level.down(self.config.gravity)
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
-                # If the prediction was taken back, that pose may have jumped, or the IMU be wrong:
-                # the velocity may be either. Else samples were missing, or absurd.
-                away = (velocity - self._odometry.state.velocity) * self._rejected
-                doubt = np.outer(away, away)
-                velocity, spread = self._gone_on(stamp, velocity, spread + doubt)
-                self._odometry.restart(stamp, pose, velocity, spread + doubt)
+                velocity, spread = self._gone_on(stamp, velocity, spread)
+                self._odometry.restart(stamp, pose, velocity, spread)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
                 sigmas = StartSigmas(gravity=_UNFELT / self.config.gravity) if level.felt else None
                 self._odometry = InertialOdometry(
@@ -268,13 +264,19 @@ class TightCoupling:
     def _gone_on(
         self, stamp: int, velocity: FloatArray, spread: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """A velocity (3,) and its covariance (3, 3), with the one before a gap in the samples."""
+        """A velocity (3,) and its covariance (3, 3), with the one before.
+
+        In between, samples were missing or absurd. If the prediction was taken back instead, the
+        pose may have jumped, or the IMU be wrong: the velocity may be either.
+        """
         assert self._odometry is not None
         state = self._odometry.state
+        away = velocity - state.velocity
+        doubt = np.outer(away, away) if self._rejected else np.zeros((3, 3))
         grown = _UNFELT * (stamp - state.stamp) * 1e-9
         before = state.covariance[VELOCITY, VELOCITY] + grown**2 * np.eye(3)
-        gain = before @ np.linalg.inv(before + spread)
-        return state.velocity + gain @ (velocity - state.velocity), symmetric(gain @ spread)
+        gain = before @ np.linalg.inv(before + spread + doubt)
+        return state.velocity + gain @ away, symmetric(gain @ (spread + doubt)) + doubt
 
     def _believable(self, first: int, last: int, buffer: ImuBuffer) -> bool:
         """Whether a lidar that is carried about may feel what it felt between two stamps."""

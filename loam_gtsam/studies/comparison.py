@@ -343,9 +343,12 @@ def _consistency(run: SolverRun, truth: Trajectory) -> dict[str, Any]:
     since_start = evaluation.nees(run.updates, truth)
     ok = [n for n in since_start.beyond if run.updates[n].status is FrameStatus.OK]
     step = evaluation.nees(run.updates, truth, window=1)
-    broken = float(since_start.broken + step.broken)
-    found = {"nees": since_start.mean, "nees_step": step.mean}
-    return found | {"broken": broken, "beyond": float(len(ok))}
+    return {
+        "nees": since_start.mean,
+        "nees_step": step.mean,
+        "broken": float(since_start.broken + step.broken),
+        "beyond": float(len(ok)),
+    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -232,12 +232,12 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     bad = np.abs(norms[:, 0] - 1.0) > UNIT_TOLERANCE
     orientation[bad] = np.nan
     unknown = bool(2 * bad.sum() > len(bad))
-    if bad.any() and not unknown:
+    if unknown:
+        problems.append("IMU: no orientation in it (not given, or not of unit length)")
+    elif bad.any():
         problems.append(
             f"IMU: {bad.sum()} of {len(bad)} orientations are not of unit length, left out"
         )
-    if unknown:
-        problems.append("IMU: no orientation in it (not given, or not of unit length)")
     if is_in_g(acceleration):
         median = float(np.median(np.linalg.norm(acceleration, axis=1)))
         problems.append(f"IMU: acceleration of {median:.2f} at rest is in g, converted to m/s^2")

@@ -109,16 +109,16 @@ def _parabola(
     through the next three. For the very first its reference time stands, where the pose is held.
     """
     one, stamp = sweeps[number], sweeps[number].moment.stamp
-    begins = min(max(number - 1, 0), len(sweeps) - 3)
-    through = [sweep.moment[:2] for sweep in sweeps[begins : begins + 3]]
+    middles = [sweep.moment[:2] for sweep in sweeps]
     if number == 0:
         held, ahead = one.posed.sweep.reference_stamp, _AHEAD * one.posed.sweep.duration
-        later = [at for sweep in sweeps if (at := sweep.moment[:2])[0] - held >= 1e9 * ahead]
+        later = [middle for middle in middles if middle[0] - held >= 1e9 * ahead]
         through = [(held, map_T_first), *later[:2]]
-    if len(through) < 3:
-        return one.posed.twist, np.zeros(6)
+    else:
+        begins = min(number - 1, len(sweeps) - 3)
+        through = middles[begins : begins + 3]
     times = np.array([(near - stamp) * 1e-9 for near, _ in through])
-    if np.diff(times).min() < _APART * one.posed.sweep.duration:
+    if len(times) < 3 or np.diff(times).min() < _APART * one.posed.sweep.duration:
         return one.posed.twist, np.zeros(6)
     steps = [gtsam.Pose3.Logmap(one.map_T_middle.between(pose)) for _, pose in through]
     powers = np.stack([np.ones(3), times, 0.5 * times**2], axis=1)

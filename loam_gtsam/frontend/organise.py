@@ -354,8 +354,9 @@ def _times_from_azimuth(
         start = float(np.deg2rad(sensor.start_azimuth_deg))
     else:
         start = _beginning(azimuth, steps, same_ring) if in_order else np.pi
-    turned = columns.azimuth * np.float32(sign / (2.0 * np.pi)) - sign * start / (2.0 * np.pi)
-    fraction = (turned - np.floor(turned)).astype(np.float64)
+    turned = columns.azimuth * np.float32(sign / (2.0 * np.pi))
+    turned = turned - np.float64(sign * start / (2.0 * np.pi))
+    fraction = turned - np.floor(turned)
     if in_order:
         fraction[order] += _seam_turns(fraction[order], same_ring)
     moment = "start" if sensor.stamp == "auto" else sensor.stamp

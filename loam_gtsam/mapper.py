@@ -284,7 +284,7 @@ class Mapper:
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         accept(frame, found, self.monitor)
         scan = self.errors.of_scan(solution, posed.sweep, small=self.maps.small)
-        told = frame.matcher.last, solution, scan, frame.priors
+        told = frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)
         if found.message or unlike:

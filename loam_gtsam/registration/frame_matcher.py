@@ -464,10 +464,10 @@ class Frame:
         """The sweep."""
         return self.matcher.posed.sweep
 
-    def solve(self, solver: ScanSolver) -> Solution:
-        """The pose at the middle of the sweep, from the predicted one."""
-        start = self.predicted.map_T_middle
-        return solver.solve(self.matcher, start, self.priors, self.predicted.motion)
+    def solve(self, solver: ScanSolver, more: Sequence[gtsam.NonlinearFactor] = ()) -> Solution:
+        """The pose at the middle of the sweep, from the predicted one, with more factors on it."""
+        start, factors = self.predicted.map_T_middle, [*self.priors, *more]
+        return solver.solve(self.matcher, start, factors, self.predicted.motion)
 
     def posed_for(self, solution: Solution) -> PosedSweep:
         """The sweep, de-skewed with the motion that belongs to a solution."""

@@ -57,14 +57,17 @@ def with_imu(
     solution: Solution,
     scan: ScanError | None,
     factors: Sequence[gtsam.NonlinearFactor],
+    beside_imu: bool = False,
 ) -> Registration:
     """What :meth:`ImuTracker.add_scan` makes of a solved sweep; the sweep as solved without one.
 
-    ``scan`` is the error of the scan, and ``factors`` are those it was solved with.
+    ``scan`` is the error of the scan, and ``factors`` are those it was solved with, beside the IMU
+    or not.
     """
     if imu is None:
         return Registration(posed, solution, solution.map_T_lidar.compose(posed.middle_T_reference))
-    alone = None if scan is None else scan.with_factors(solution.map_T_lidar, factors)
+    pose = solution.map_T_lidar
+    alone = None if scan is None else scan.with_factors(pose, factors, alone=not beside_imu)
     return imu.add_scan(posed, last, solution, alone)
 
 

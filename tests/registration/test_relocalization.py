@@ -440,12 +440,55 @@ def test_a_place_that_an_imu_contradicts_is_none(metres, measured, left):
     told = MotionPrior(gtsam.Pose3(), 1e4 * np.eye(6), measured=measured)
     places = [
         SimpleNamespace(
+            solved=True,
             map_T_lidar=gtsam.Pose3(gtsam.Rot3(), [0.0, x, 0.0]),
             information=np.diag([1e8, 1e8, 1e8, 1e8, 0.0 if x == 4.0 else 2500.0, 1e8]),
         )
         for x in metres
     ]
     assert doubtful_sweeps._as_measured(places, told) == [places[k] for k in left]
+
+
+class _OneStepUp(GtsamSolver):
+    """The scan alone ends a step of the stairs too high; beside the IMU it keeps some matches."""
+
+    keeps = 1.0
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        found = super().solve(associate, guess, priors, motion)
+        if priors:
+            kinds = found.matches.edges, found.matches.planes
+            kept = [subset(kind, np.arange(len(kind)) < self.keeps * len(kind)) for kind in kinds]
+            return replace(found, matches=ScanMatches(*kept))
+        return replace(found, map_T_lidar=found.map_T_lidar.retract([0, 0, 0, 0, 0, 0.2]))
+
+
+@pytest.mark.parametrize(
+    ("solver", "keeps", "measured", "away", "beside"),
+    [
+        (_OneStepUp, 1.0, True, 0.0, True),
+        (_OneStepUp, 0.5, True, 0.0, False),  # there it hardly fits
+        (_OneStepUp, 1.0, False, 0.0, False),  # no IMU says so
+        (GtsamSolver, 1.0, True, 0.3, False),  # the IMU is wrong: the scan leads away all the same
+        (GtsamSolver, 1.0, True, 0.0, False),  # the two agree
+    ],
+)
+def test_a_scan_that_leads_away_from_the_imu_is_solved_beside_it(
+    solver, keeps, measured, away, beside, before, calm
+):
+    frame, solver = frame_of(before, list(calm)[AT]), solver(before.config.solver)
+    solver.keeps, right = keeps, frame.solve(before.solver)
+    expected = right.map_T_lidar.retract([0.0, 0.0, 0.0, away, 0.0, 0.0])
+    told = MotionPrior(expected, np.diag([1e6, 1e6, 1e6, 1e5, 1e5, 1e5]), measured=measured)
+    frame = replace(frame, predicted=replace(frame.predicted, motion=told))
+    found = doubtful_sweeps._solved(frame, solver)
+    assert found.beside_imu is beside
+    if not beside:
+        assert found.solution.map_T_lidar.equals(frame.solve(solver).map_T_lidar, 1e-9)
+        return
+    assert found.solution.map_T_lidar.range(right.map_T_lidar) < 0.005
+    # The IMU's part is not in what the scan is told to know.
+    assert np.allclose(found.solution.information, right.information, rtol=0.1, atol=1e4)
 
 
 @pytest.mark.parametrize("share", [0.9, 0.1])

@@ -172,6 +172,16 @@ def test_information_of_another_scale_is_no_prior():
     np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
 
 
+def test_a_pose_that_others_held_is_told_with_the_step_to_the_optimum():
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    pose, held = solution.map_T_lidar, np.array([0.001, 0.0, 0.0, 0.0, 0.02, 0.0])
+    error = error_of(dataclasses.replace(solution, map_T_lidar=pose.retract(held)))
+    assert np.array_equal(error.with_factors(pose, ())[1], np.zeros(6))
+    assert np.allclose(error.with_factors(pose, (), alone=False)[1], -held, atol=1e-4)
+
+
 def test_along_a_weak_direction_there_is_the_expected_motion_only():
     rng = np.random.default_rng(0)
     points, normals, _ = surroundings(rng, axes=2)  # nothing across x of the map

@@ -68,6 +68,7 @@ class Found:
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
     parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
     led: FloatArray | None = None  # (6,) velocity that led to the pose, if the sweep keeps another
+    beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +163,7 @@ def placed(
     first_motion : searches for the motion with which a map begins, while it does
     """
     last, solver = apart[2:]
-    found, given = found_at(frame, frame.solve(solver)), frame
+    found, given = _solved(frame, solver), frame
     if _gyro_begins(last, frame.sweep):
         frame, found = second_opinion(frame, found, *apart)
     if first_motion is not None:
@@ -177,6 +178,25 @@ def placed(
     if doubt is not None:
         return frame, search(frame, found.solution, monitor, solver, doubt)
     return frame, found
+
+
+def _solved(frame: Frame, solver: ScanSolver) -> Found:
+    """The sweep as the scan alone has it; beside the IMU, if the scan leads elsewhere.
+
+    Where much repeats, as on stairs, features that belong to what is not mapped yet match what is
+    next to it, and lead there. The IMU knows better; if it does not, the sweep does not fit where
+    it has it, or the scan leads away all the same.
+    """
+    alone, matcher, expected = frame.solve(solver), frame.matcher, frame.predicted.motion
+    if not _contradicts(expected, alone):
+        return found_at(frame, alone)
+    information = SCAN_VARIANCE * expected.information  # as that of the matches beside it
+    beside = frame.solve(solver, [replace(expected, information=information).factor()])
+    fits, best = (Fit.of(one.matches, matcher.offered).total for one in (beside, alone))
+    if not beside.solved or _contradicts(expected, beside) or fits < AS_WELL * best:
+        return found_at(frame, alone)
+    told = replace(beside, information=beside.information - information)  # the IMU is heard later
+    return replace(found_at(frame, told), beside_imu=True)
 
 
 def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
@@ -434,14 +454,17 @@ def _places(
 
 def _as_measured(places: list[Solution], expected: MotionPrior) -> list[Solution]:
     """The places that gyro and accelerometer do not contradict; all, if they contradict each."""
-    if not expected.measured:
-        return places
-    agree = []
-    for place in places:
-        step = expected.map_T_lidar.localCoordinates(place.map_T_lidar)
-        by_both = parallel_sum(expected.information, place.information / SCAN_VARIANCE)
-        agree.append(step @ by_both @ step < _UNLIKELY)
+    agree = [not _contradicts(expected, place) for place in places]
     return list(compress(places, agree)) or places
+
+
+def _contradicts(expected: MotionPrior, solution: Solution) -> bool:
+    """Whether gyro and accelerometer, if they tell the expected pose, contradict a solved one."""
+    if not (expected.measured and solution.solved):
+        return False
+    step = expected.map_T_lidar.localCoordinates(solution.map_T_lidar)
+    by_both = parallel_sum(expected.information, solution.information / SCAN_VARIANCE)
+    return bool(step @ by_both @ step >= _UNLIKELY)
 
 
 def _moved(points: FloatArray, one: gtsam.Pose3, other: gtsam.Pose3) -> float:

@@ -91,12 +91,13 @@ class ScanError:
         return symmetric(factor * pulled + taken_over)
 
     def with_factors(
-        self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor]
-    ) -> tuple[FloatArray, FloatArray]:
+        self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor],
+        *, alone: bool = True,
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         """What scan and further factors, each by its true share, say of the pose.
 
         ``map_T_lidar`` is the pose that was solved with these factors on
-        :data:`~loam_gtsam.registration.solvers.POSE_KEY`.
+        :data:`~loam_gtsam.registration.solvers.POSE_KEY`, and, if not ``alone``, with others.
 
         Returns
         -------
@@ -105,7 +106,7 @@ class ScanError:
             this is linear near the pose only, which is therefore not moved there.
         """
         if not factors:
-            return self.information, np.zeros(6)
+            return self.information, np.zeros(6) if alone else self.step
         theirs, pull = linearized(factors, map_T_lidar)
         information: FloatArray = self.information + theirs
         step = np.linalg.lstsq(information, self.information @ self.step + pull, rcond=None)[0]

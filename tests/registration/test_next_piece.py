@@ -14,10 +14,16 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
-from loam_gtsam.registration.relocalization import CONTINUED, FitMonitor, Gap, goes_on
+from loam_gtsam.registration.relocalization import (
+    CONTINUED,
+    FitMonitor,
+    Gap,
+    NextPiece,
+    goes_on,
+)
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.studies.evaluation import nees
-from loam_gtsam.types import FrameStatus
+from loam_gtsam.types import FrameStatus, Trajectory
 
 AT, AGAIN, LOST = 8, 20, 8
 """The first missing sweep, the first one after the gap, and how many are lost then."""
@@ -64,6 +70,22 @@ def test_a_run_goes_on_after_a_gap_and_tells_how_well_it_knows_where(avenue, res
     assert (within < np.repeat([2e-3, 0.05], 3)).all()
     assert (across > np.repeat([0.05, 0.3], 3)).all()
     assert (np.sqrt(np.diag(after[-1].covariance))[:3] > 0.05).all()
+
+
+def test_a_gap_of_which_the_stamps_do_not_tell_is_told(avenue):
+    """What is not found so near the last place is elsewhere, for all that the motion says."""
+    world, sweeps = avenue
+    hidden = sweeps[AGAIN].stamp - sweeps[AT].stamp
+    later = [replace(sweep, stamp=sweep.stamp - hidden) for sweep in sweeps[AGAIN:]]
+    config = CONFIG.changed("relocalization.radius=12", "relocalization.max_radius=12")
+    updates = run(ArrayDataset(sweeps[:AT] + later, sensor=world.sensor), config).updates
+    assert CONTINUED in updates[AT + LOST - 1].message
+    stamps = np.delete(world.truth.stamps, np.s_[AT:AGAIN])
+    stamps[AT:] -= hidden
+    truth = Trajectory(stamps, np.delete(world.truth.map_T_lidar, np.s_[AT:AGAIN], axis=0))
+    assert squared_distance(truth, updates[AT - 1], updates[-1]) < 25.0
+    away = truth.map_T_lidar[-1, :3, 3] - updates[-1].map_T_lidar.translation()
+    assert np.linalg.norm(away - truth.map_T_lidar[0, :3, 3]) > 30.0
 
 
 def test_a_start_that_a_gap_interrupts_ends_with_its_piece(avenue):
@@ -149,6 +171,20 @@ def test_a_checkpoint_holds_the_piece_that_is_not_used_yet(carried, monkeypatch)
         np.testing.assert_array_equal(*(update.map_T_lidar.matrix() for update in updates))
         np.testing.assert_array_equal(*(update.covariance for update in updates))
     assert two.mapper.maps.earlier is not None
+
+
+@pytest.mark.parametrize(
+    ("metres", "turned", "sigmas"),
+    [(3.0, None, (1.28, 7.07)), (3.0, gtsam.Rot3(), (0.0, 7.07)), (11.0, None, (0.0, 0.0))],
+)
+def test_what_is_not_found_where_it_was_searched_may_be_anywhere(metres, turned, sigmas):
+    """Farther off than that, the map need not have it."""
+    piece = NextPiece(gap())
+    piece._turned = turned
+    pose = gap().map_T_lidar.compose(gtsam.Pose3(gtsam.Rot3(), [metres, 0.0, 0.0]))
+    body = pose.inverse().AdjointMap()
+    covariance = body @ piece._carried_off(pose, 10.0) @ body.T
+    assert np.allclose(np.sqrt(np.diag(covariance)), np.repeat(sigmas, 3), atol=0.01)
 
 
 def gap(twist=FORWARD, stamp=0):

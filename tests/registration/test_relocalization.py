@@ -45,6 +45,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
     search,
 )
+from loam_gtsam.registration.relocalization import places as places_module
 from loam_gtsam.registration.relocalization.evidence import Evidence, favour
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior
@@ -419,11 +420,11 @@ def test_of_places_that_fit_as_well_the_nearest_comes_first(
         solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start, matches=0)
     )
     told = iter(fits)
-    monkeypatch.setattr(doubtful_sweeps, "likely_poses", lambda *_, **__: places)
+    monkeypatch.setattr(places_module, "likely_poses", lambda *_, **__: places)
     monkeypatch.setattr(Fit, "of", lambda *_: SimpleNamespace(total=next(told)))
     unsolved = SimpleNamespace(solved=False)
     watch = SimpleNamespace(lost=lost, radius=10.0, around=lambda pose: [pose])
-    found = doubtful_sweeps._places(frame, unsolved, watch, solver)
+    found = places_module.likely_places(frame, unsolved, watch, solver)
     assert [id(pose) for pose in found] == [id(places[k]) for k in order]
 
 
@@ -446,7 +447,7 @@ def test_a_place_that_an_imu_contradicts_is_none(metres, measured, left):
         )
         for x in metres
     ]
-    assert doubtful_sweeps._as_measured(places, told) == [places[k] for k in left]
+    assert places_module._as_measured(places, told) == [places[k] for k in left]
 
 
 class _OneStepUp(GtsamSolver):
@@ -564,6 +565,34 @@ def test_what_is_in_doubt_is_believed_elsewhere_only_if_its_features_say_so(befo
     assert (kept.solution, kept.message) == (solution, "")
 
 
+def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm):
+    """If it fits as usual, only its motion is another one."""
+    frame = frame_of(before, list(calm)[AT])
+    solution, monitor = frame.solve(before.solver), deepcopy(before.monitor)
+    wrong = replace(solution, map_T_lidar=solution.map_T_lidar.retract([0, 0, 0.2, 0, 0, 0]))
+    wrong = replace(wrong, matches=frame.matcher(wrong.map_T_lidar))
+    assert monitor.unusual(Fit.of(wrong.matches, frame.matcher.offered))
+    found = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
+    assert found.message.startswith("relocalised")
+    assert found.solution.map_T_lidar.equals(solution.map_T_lidar, 1e-2)
+    monitor.unusual = lambda fit: False
+    kept = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
+    assert not kept.message.startswith("relocalised")
+
+
+def test_of_places_where_a_sweep_fits_again_its_features_choose(before, calm, monkeypatch):
+    """The nearest, unless they speak for another one."""
+    frame = frame_of(before, list(calm)[AT])
+    solution, monitor = frame.solve(before.solver), deepcopy(before.monitor)
+    monitor.fits_again = lambda fit: True
+    right = solution.map_T_lidar
+    beside = right.retract([0.0, 0.0, 1.5, 2.0, 0.0, 0.0])
+    for places in ([right, beside], [beside, right]):
+        monkeypatch.setattr(doubtful_sweeps, "likely_places", lambda *_, p=places: p)
+        found = search(frame, solution, monitor, before.solver, Doubt.MISFIT)
+        assert found.solution.map_T_lidar.range(right) < 0.02
+
+
 @pytest.mark.parametrize("objects", [True, False])
 def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, monkeypatch):
     frame = frame_of(before, list(calm)[AT])
@@ -574,7 +603,8 @@ def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, mon
         solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start)
     )
     monkeypatch.setattr(doubtful_sweeps, "_speaks_for", lambda *_: objects)
-    rivals = doubtful_sweeps._rivals(frame, found, places, solver)
+    others = doubtful_sweeps._others(frame, found, places, solver)
+    rivals = doubtful_sweeps._rivals(frame, found, others)
     assert rivals == ([] if objects else places[1:])  # the first is the same place
 
 

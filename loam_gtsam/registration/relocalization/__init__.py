@@ -5,7 +5,6 @@ from loam_gtsam.registration.relocalization.doubtful_sweeps import Doubt as Doub
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Found as Found
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Lost as Lost
 from loam_gtsam.registration.relocalization.doubtful_sweeps import accept as accept
-from loam_gtsam.registration.relocalization.doubtful_sweeps import any_of as any_of
 from loam_gtsam.registration.relocalization.doubtful_sweeps import doubtful as doubtful
 from loam_gtsam.registration.relocalization.doubtful_sweeps import found_at as found_at
 from loam_gtsam.registration.relocalization.doubtful_sweeps import placed as placed
@@ -25,3 +24,4 @@ from loam_gtsam.registration.relocalization.next_piece import CONTINUED as CONTI
 from loam_gtsam.registration.relocalization.next_piece import Gap as Gap
 from loam_gtsam.registration.relocalization.next_piece import NextPiece as NextPiece
 from loam_gtsam.registration.relocalization.next_piece import goes_on as goes_on
+from loam_gtsam.registration.relocalization.places import any_of as any_of

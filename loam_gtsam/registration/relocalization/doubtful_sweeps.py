@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import compress
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
-from loam_gtsam.geometry import five_sigma, parallel_sum
-from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import advance, predict, solved_twist, timed_rows
@@ -25,16 +21,16 @@ from loam_gtsam.registration.relocalization.fits import (
     FitMonitor,
     beyond_any_motion,
     same,
-    step_in_map,
 )
-from loam_gtsam.registration.relocalization.likely_poses import (
-    MORE_EDGES,
-    Field,
-    likely_poses,
-    sample_features,
+from loam_gtsam.registration.relocalization.places import (
+    any_of,
+    contradicts,
+    likely_places,
+    moved,
+    solved_near,
 )
 from loam_gtsam.registration.report import distance_in_words, make_update
-from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
+from loam_gtsam.registration.solvers import ScanSolver, Solution
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
 from loam_gtsam.registration.solvers.own_factors import NamedSolver
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, SweepMotion
@@ -42,8 +38,6 @@ from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, Sweep
 _CLOSER = 3  # largest number of places that are looked at closer
 _BASIN = 0.5
 """Part of the reach of a match, from within which a solve converges: as the spacing of trials."""
-_UNLIKELY = five_sigma(6)  # from which on a place contradicts an IMU
-_PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 _TOLD = 3  # times that a sweep which fits with no expected motion tells one by itself
 _ANY = 1e3  # rad/s and m/s: standard deviation of a motion of which nothing is known
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
@@ -118,7 +112,7 @@ def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit:
         return False
     matches, reach = solution.matches, frame.matcher.config.matching.max_distance
     points = np.concatenate([matches.edges.points, matches.planes.points])
-    return _moved(points, frame.predicted.map_T_middle, solution.map_T_lidar) > _BASIN * reach
+    return moved(points, frame.predicted.map_T_middle, solution.map_T_lidar) > _BASIN * reach
 
 
 def second_opinion(
@@ -184,19 +178,22 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
     """The sweep as the scan alone has it; beside the IMU, if the scan leads elsewhere.
 
     Where much repeats, as on stairs, features that belong to what is not mapped yet match what is
-    next to it, and lead there. The IMU knows better; if it does not, the sweep does not fit where
-    it has it, or the scan leads away all the same.
+    next to it, and lead there. If the IMU is right, what is matched where it has the sweep leads
+    nowhere else, and fits as well.
     """
     alone, matcher, expected = frame.solve(solver), frame.matcher, frame.predicted.motion
-    if not _contradicts(expected, alone):
+    if not contradicts(expected, alone):
         return found_at(frame, alone)
-    information = SCAN_VARIANCE * expected.information  # as that of the matches beside it
-    beside = frame.solve(solver, [replace(expected, information=information).factor()])
-    fits, best = (Fit.of(one.matches, matcher.offered).total for one in (beside, alone))
-    if not beside.solved or _contradicts(expected, beside) or fits < AS_WELL * best:
+    prior = SCAN_VARIANCE * expected.information  # as that of the matches beside it
+    both = frame.solve(solver, [replace(expected, information=prior).factor()])
+    beside = replace(both, information=both.information - prior)  # the IMU is heard later
+    pull = prior @ expected.map_T_lidar.localCoordinates(both.map_T_lidar)
+    step = np.linalg.lstsq(beside.information, pull, rcond=None)[0]
+    optimum = replace(beside, map_T_lidar=both.map_T_lidar.retract(step))
+    fits, best = (Fit.of(one.matches, matcher.offered).total for one in (both, alone))
+    if not both.solved or contradicts(expected, optimum) or fits < AS_WELL * best:
         return found_at(frame, alone)
-    told = replace(beside, information=beside.information - information)  # the IMU is heard later
-    return replace(found_at(frame, told), beside_imu=True)
+    return replace(found_at(frame, beside), beside_imu=True)
 
 
 def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
@@ -212,28 +209,35 @@ def search(
 ) -> Found | Lost:
     """Search for the pose of a sweep whose solution is doubtful.
 
-    A sweep that jumped is solved again with the motion from before. One that does not fit is looked
-    for around the expected pose; so is one that may have another optimum, which is believed only if
-    the features speak for it.
+    One that does not fit is looked for around the expected pose. So is one that may have another
+    optimum, or jumped to where it fits unusually little; that is believed only if the features
+    speak for it. Else one that jumped is solved again with the motion from before.
     """
     matcher = frame.matcher
     if doubt is Doubt.MISFIT:
         found = _elsewhere(frame, solution, monitor, solver)
         matcher.clock.lap("relocalize")
         return _lost(frame, solution, monitor, solver) if found is None else found
-    stays = found_at(frame, solution)
-    if doubt is Doubt.JUMP:
-        twists = [matcher.posed.twist, stays.posed.twist]
-        found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
-        if found is not None and found.posed.twist is stays.posed.twist:
-            found = None
-        if found is not None and matcher.last is not None:
-            led = matcher.last.twist_to(frame.sweep.stamp, found.solution.map_T_lidar)
-            found = replace(found, led=led)
-    else:
+    stays, found = found_at(frame, solution), None
+    if doubt is Doubt.OPTIMUM or monitor.unusual(Fit.of(solution.matches, matcher.offered)):
         found = _elsewhere(frame, solution, monitor, solver, stays)
+    if found is None and doubt is Doubt.JUMP:
+        found = _as_before(frame, stays, monitor, solver)
     matcher.clock.lap("relocalize")
-    return stays if found is None else found
+    return found or stays
+
+
+def _as_before(
+    frame: Frame, jumped: Found, monitor: FitMonitor, solver: ScanSolver
+) -> Found | None:
+    """A sweep that jumped, with the motion from before, unless the one that led there fits."""
+    matcher, pose = frame.matcher, jumped.solution.map_T_lidar
+    twists = [matcher.posed.twist, jumped.posed.twist]
+    found = _with_motion(frame, pose, twists, monitor, solver)
+    if found is None or matcher.last is None or found.posed.twist is jumped.posed.twist:
+        return None
+    led = matcher.last.twist_to(frame.sweep.stamp, found.solution.map_T_lidar)
+    return replace(found, led=led)
 
 
 def _lost(frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver) -> Lost:
@@ -261,42 +265,59 @@ def _elsewhere(
 ) -> Found | None:  # fmt: skip
     """The sweep in the first of the likely places in which it fits again; None if in none.
 
-    If it ``stays`` where it was solved otherwise, its features must speak against that.
+    If it ``stays`` where it was solved otherwise, its features must speak against that. Another
+    place is taken in its stead if they speak for that one.
     """
-    places = _places(frame, solution, monitor, solver)
+    places = likely_places(frame, solution, monitor, solver)
     other = np.zeros(6) if stays is None else stays.posed.twist
-    for place in places[: 1 if monitor.lost else _CLOSER]:
+
+    def fitting(place: gtsam.Pose3, rival: Found | None) -> Found | None:
         twists = _motions(frame, place, other)
         found = _with_motion(frame, place, twists, monitor, solver, told=True)
-        if found is None:
-            continue
+        if found is None or rival is None:
+            return found
         matcher = frame.matcher.moving_at(found.posed.twist)
-        here = Evidence.of(matcher, found.solution, dense=True)
-        if stays is None or _speaks_for(here, stays.solution, matcher):
-            rivals = any_of(found.solution.map_T_lidar, _rivals(frame, found, places, solver))
-            after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
-            return replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=rivals)
-    return None
+        return found if _speaks_for(matcher, found.solution, rival.solution) else None
+
+    near = (fitting(place, stays) for place in places[: 1 if monitor.lost else _CLOSER])
+    first = next(filter(None, near), None)
+    if first is None:
+        return None
+    matcher, others = (
+        frame.matcher.moving_at(first.posed.twist),
+        _others(frame, first, places, solver),
+    )
+    found = first
+    for there in others:
+        if _speaks_for(matcher, there, first.solution):
+            found = fitting(there.map_T_lidar, found) or found
+    if found is not first:
+        others = _others(frame, found, places, solver)
+    doubt = any_of(found.solution.map_T_lidar, _rivals(frame, found, others))
+    after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
+    return replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=doubt)
 
 
-def _speaks_for(here: Evidence, other: Solution, matcher: FrameMatcher) -> bool:
-    """Whether the features of a matcher speak for a place against another one, beyond chance."""
-    there = Evidence.of(matcher, other, dense=True)
-    return speaks_for(here, there, matcher.config.solver.min_aligned)
-
-
-def _rivals(
+def _others(
     frame: Frame, found: Found, places: Sequence[gtsam.Pose3], solver: ScanSolver
-) -> list[gtsam.Pose3]:
-    """Other places than the one where the sweep was found, to which its features do not object."""
-    rivals, matcher = [], frame.matcher.moving_at(found.posed.twist)
-    here = Evidence.of(matcher, found.solution, dense=True)
-    for place in places:
-        if not same(place, found.solution.map_T_lidar):
-            other = _solved_near(frame, matcher, place, solver)
-            if other.solved and not _speaks_for(here, other, matcher):
-                rivals.append(other.map_T_lidar)
-    return rivals
+) -> list[Solution]:
+    """The sweep as solved near other places than the one where it was found."""
+    matcher, here = frame.matcher.moving_at(found.posed.twist), found.solution.map_T_lidar
+    away = (place for place in places if not same(place, here))
+    solved = (solved_near(frame, matcher, place, solver) for place in away)
+    return [one for one in solved if one.solved]
+
+
+def _rivals(frame: Frame, found: Found, others: Sequence[Solution]) -> list[gtsam.Pose3]:
+    """Other places to which the features of a sweep that was found do not object."""
+    matcher = frame.matcher.moving_at(found.posed.twist)
+    return [one.map_T_lidar for one in others if not _speaks_for(matcher, found.solution, one)]
+
+
+def _speaks_for(matcher: FrameMatcher, one: Solution, other: Solution) -> bool:
+    """Whether the features of a matcher speak for a place against another one, beyond chance."""
+    here, there = (Evidence.of(matcher, place, dense=True) for place in (one, other))
+    return speaks_for(here, there, matcher.config.solver.min_aligned)
 
 
 def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatArray]:
@@ -349,7 +370,7 @@ def _tried(
     frame: Frame, matcher: FrameMatcher, place: gtsam.Pose3, solver: ScanSolver
 ) -> tuple[Fit, Solution, PosedSweep]:
     """The sweep near a place, as it is de-skewed, and how it fits there."""
-    found = _solved_near(frame, matcher, place, solver)
+    found = solved_near(frame, matcher, place, solver)
     return Fit.of(found.matches, matcher.offered), found, matcher.posed
 
 
@@ -378,26 +399,6 @@ def _by_own_motion(
     return None
 
 
-def _solved_near(
-    frame: Frame, matcher: FrameMatcher, place: gtsam.Pose3, solver: ScanSolver
-) -> Solution:
-    """The sweep, solved from a place: along directions that its matches leave open it stays."""
-    here = MotionPrior(place, frame.predicted.motion.information)
-    return solver.solve(matcher, place, frame.priors, here)
-
-
-def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | None:
-    """Covariance (6, 6) of a pose, map frame, if one of the rivals may be right; None without any.
-
-    The mean squared error of any of the places, about each.
-    """
-    if not rivals:
-        return None
-    steps = np.array([step_in_map(pose, rival) for rival in rivals])
-    total: FloatArray = steps.T @ steps / (1 + len(rivals))
-    return total
-
-
 def accept(frame: Frame, found: Found, monitor: FitMonitor) -> None:
     """Tell the monitor of a sweep that goes into the map where it was found."""
     solution = found.solution
@@ -418,61 +419,6 @@ def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpd
         message = f"{len(solution.matches)} matches; {least} are needed"
     predicted = frame.predicted
     return make_update(predicted.posed, predicted.map_T_lidar, status, message, solution)
-
-
-def _places(
-    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
-) -> list[gtsam.Pose3]:
-    """The poses around the prediction at which a few matches fit best, or as well but for chance.
-
-    Where much repeats, a place one bay farther on fits as well. The nearest, which comes first, is
-    the likeliest. Once it was tried in vain, the best comes first.
-    """
-    matcher, expected = frame.matcher, frame.predicted.map_T_middle
-    around = monitor.around(expected)
-    known = [
-        cubes.points(cubes.neighbourhood(pose.matrix()))
-        for pose in around
-        for cubes in (matcher.maps.edges, matcher.maps.planes)
-    ]
-    starts = [solution.map_T_lidar] if solution.solved else []
-    points = sample_features(*matcher.posed.points, MORE_EDGES)
-    as_well = None if monitor.lost else AS_WELL
-    held = np.concatenate(known)
-    fields = [Field.around(held, pose, monitor.radius) for pose in around]
-    starts += likely_poses(points, fields, around, _PLACES, rare=True, as_well=as_well)
-    matcher.clock.lap("relocalize")
-    trial = replace(matcher, refine=False).with_few_matches()
-    tried = [_solved_near(frame, trial, start, solver) for start in starts]
-    solved = _as_measured([one for one in tried if one.solved], frame.predicted.motion)
-    places = [(Fit.of(one.matches, trial.offered).total, one.map_T_lidar) for one in solved]
-    best = max((total for total, _ in places), default=0.0)
-    as_good = [place for place in places if place[0] >= AS_WELL * best]
-    ranks = [-total if monitor.lost else _moved(points, expected, pose) for total, pose in as_good]
-    return [as_good[number][1] for number in np.argsort(ranks, kind="stable")]
-
-
-def _as_measured(places: list[Solution], expected: MotionPrior) -> list[Solution]:
-    """The places that gyro and accelerometer do not contradict; all, if they contradict each."""
-    agree = [not _contradicts(expected, place) for place in places]
-    return list(compress(places, agree)) or places
-
-
-def _contradicts(expected: MotionPrior, solution: Solution) -> bool:
-    """Whether gyro and accelerometer, if they tell the expected pose, contradict a solved one."""
-    if not (expected.measured and solution.solved):
-        return False
-    step = expected.map_T_lidar.localCoordinates(solution.map_T_lidar)
-    by_both = parallel_sum(expected.information, solution.information / SCAN_VARIANCE)
-    return bool(step @ by_both @ step >= _UNLIKELY)
-
-
-def _moved(points: FloatArray, one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    """Root mean square of the distances, metres, between points (N, 3) at one pose and another."""
-    form = displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
-    step = one.localCoordinates(other)
-    squared = float(step @ form @ step)
-    return math.sqrt(max(squared, 0.0))
 
 
 def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:

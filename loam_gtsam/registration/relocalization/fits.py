@@ -186,8 +186,16 @@ class FitMonitor:
     @property
     def radius(self) -> float:
         """Search radius around the prediction, metres; grows with every lost sweep."""
+        return self._radius_after(self.lost)
+
+    @property
+    def widest(self) -> float:
+        """The radius that is searched before the run goes on in another piece of map, metres."""
+        return self._radius_after(self.config.new_piece)
+
+    def _radius_after(self, lost: int) -> float:
         config = self.config
-        return min(config.radius + config.radius_growth * self.lost, config.max_radius)
+        return min(config.radius + config.radius_growth * lost, config.max_radius)
 
     def around(self, predicted: gtsam.Pose3) -> list[gtsam.Pose3]:
         """Centres of the search: the prediction, and the pose of the last sweep that fitted.

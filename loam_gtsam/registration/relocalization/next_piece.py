@@ -158,10 +158,24 @@ class NextPiece:
             return
         sweeps, self._first, twist = self._first, [], self._last.twist
         pose, covariance = self.gap.bridged(sweeps[0].stamp, twist, self._turned)
-        self.mapper = _another(beside, covariance)
+        carried = self._carried_off(pose, beside.monitor.widest)
+        self.mapper = _another(beside, covariance + carried)
         self.mapper.register(sweeps[0], pose, twist)
         for sweep in sweeps[1:]:
             self._last = self.mapper.register(sweep)
+
+    def _carried_off(self, pose: gtsam.Pose3, searched: float) -> FloatArray:
+        """Covariance (6, 6) of the piece, on the left, in map axes, if no motion led to it.
+
+        The motion leads to ``pose``. If that is less than the radius that is ``searched``, metres,
+        from the last sweep that was found, the map has what is seen there. As likely as not, the
+        lidar is farther off: it was carried, or sweeps are missing of which the stamps do not tell.
+        """
+        if pose.range(self.gap.map_T_lidar) > searched:
+            return np.zeros((6, 6))
+        sigmas = np.repeat([ANYWHERE[0] if self._turned is None else 0.0, searched], 3)
+        to_map = pose.AdjointMap() * sigmas
+        return symmetric(0.5 * to_map @ to_map.T)
 
 
 def _another(beside: Mapper, uncertain: FloatArray) -> Mapper:

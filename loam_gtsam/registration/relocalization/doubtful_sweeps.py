@@ -16,6 +16,7 @@ from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import advance, predict, solved_twist, timed_rows
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
+    AGREE,
     AS_WELL,
     Fit,
     FitMonitor,
@@ -110,9 +111,14 @@ def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit:
     """
     if not monitor.unusual(fit):
         return False
-    matches, reach = solution.matches, frame.matcher.config.matching.max_distance
-    points = np.concatenate([matches.edges.points, matches.planes.points])
-    return moved(points, frame.predicted.map_T_middle, solution.map_T_lidar) > _BASIN * reach
+    reach = frame.matcher.config.matching.max_distance
+    return _led(solution, frame.predicted.map_T_middle) > _BASIN * reach
+
+
+def _led(solution: Solution, away: gtsam.Pose3) -> float:
+    """Metres, root mean square, between the matched features of a solution and at another pose."""
+    points = np.concatenate([solution.matches.edges.points, solution.matches.planes.points])
+    return moved(points, away, solution.map_T_lidar)
 
 
 def second_opinion(
@@ -179,7 +185,7 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
 
     Where much repeats, as on stairs, features that belong to what is not mapped yet match what is
     next to it, and lead there. If the IMU is right, what is matched where it has the sweep leads
-    nowhere else, and fits as well.
+    nowhere else, and fits as well. Where the same matches agree, it is no other place.
     """
     alone, matcher, expected = frame.solve(solver), frame.matcher, frame.predicted.motion
     if not contradicts(expected, alone):
@@ -191,7 +197,9 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
     step = np.linalg.lstsq(beside.information, pull, rcond=None)[0]
     optimum = replace(beside, map_T_lidar=both.map_T_lidar.retract(step))
     fits, best = (Fit.of(one.matches, matcher.offered).total for one in (both, alone))
-    if not both.solved or contradicts(expected, optimum) or fits < AS_WELL * best:
+    sigmas = np.concatenate([alone.matches.edges.sigmas, alone.matches.planes.sigmas])
+    elsewhere = both.solved and _led(alone, both.map_T_lidar) > AGREE * np.median(sigmas)
+    if not elsewhere or contradicts(expected, optimum) or fits < AS_WELL * best:
         return found_at(frame, alone)
     return replace(found_at(frame, beside), beside_imu=True)
 

@@ -14,7 +14,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration.start.paths import on_paths
+from loam_gtsam.registration.start.paths import on_paths, with_velocity
 from loam_gtsam.registration.start.ways import EarlySweep
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Features
@@ -68,6 +68,19 @@ def test_where_the_first_sweep_tells_no_velocity_all_are_constant():
         np.testing.assert_allclose(now.posed.twist, twist)
         assert now.posed.sweep.acceleration is None
     np.testing.assert_array_equal(moved[0].posed.twist, moved[1].posed.twist)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_velocity_that_is_told_no_more_is_that_of_the_path(count):
+    """Of two sweeps there is no path yet."""
+    sweeps = [_sweep(n, _path(0.05 + 0.1 * n)) for n in range(count)]
+    assert with_velocity(sweeps, 0, None, FIRST, CONFIG)[0].velocity is None  # nor was it before
+    stale = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 1.0])
+    sweeps = [replace(one, velocity=stale) for one in sweeps]
+    first, *others = with_velocity(sweeps, 0, None, FIRST, CONFIG)
+    assert all(now is before for now, before in zip(others, sweeps[1:], strict=True))
+    expected = stale if count == 2 else VELOCITY + 0.05 * ACCELERATION
+    np.testing.assert_allclose(first.velocity, expected, atol=0.02)
 
 
 def _turned(model):

@@ -74,7 +74,7 @@ class EarlyMap:
             if solution.solved:
                 moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
                 moved = self._with_velocity(moved, number, solution)
-        return moved
+        return self._with_velocity(moved, 0, None)
 
     def _settled(self, before: Sequence[EarlySweep], after: Sequence[EarlySweep]) -> bool:
         """Whether features came to lie where they were, to well below their noise."""
@@ -82,7 +82,7 @@ class EarlyMap:
         return all(_shift(*pair) < most for pair in zip(before, after, strict=True))
 
     def _with_velocity(
-        self, sweeps: Sequence[EarlySweep], number: int, solution: Solution
+        self, sweeps: Sequence[EarlySweep], number: int, solution: Solution | None
     ) -> list[EarlySweep]:
         return with_velocity(sweeps, number, solution, self.map_T_first, self.config)
 

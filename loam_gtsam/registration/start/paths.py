@@ -47,16 +47,20 @@ def on_paths(sweeps: Sequence[EarlySweep], map_T_first: gtsam.Pose3) -> list[Ear
 
 
 def with_velocity(
-    sweeps: Sequence[EarlySweep], number: int, solution: Solution, map_T_first: gtsam.Pose3,
-    config: Config,
+    sweeps: Sequence[EarlySweep], number: int, solution: Solution | None,
+    map_T_first: gtsam.Pose3, config: Config,
 ) -> list[EarlySweep]:  # fmt: skip
     """The sweeps, one of them with the velocity that its matches tell, if they do.
 
     Those of the second one tell how its velocity differs from that of the first, which passed by
-    the same things at the same part of its sweep: of two sweeps both get theirs.
+    the same things at the same part of its sweep: of two sweeps both get theirs. What was told of
+    few sweeps is outdated if with more of them (None: it is not solved) nothing is told: then the
+    velocity is that of the path through the poses.
     """
     told, one, solver = list(sweeps), sweeps[number], config.solver
-    if not _tells(sweeps if len(sweeps) == 2 else [one], solution, config):
+    if solution is None or not _tells(sweeps if len(sweeps) == 2 else [one], solution, config):
+        if len(sweeps) > 2 and one.velocity is not None:
+            told[number] = replace(one, velocity=_parabola(sweeps, number, map_T_first)[0])
         return told
     rows, seconds = timed_rows(solution.matches, one.posed.sweep, solver)
     matches = rows, solution.matches.tilts, seconds, solution.map_T_lidar

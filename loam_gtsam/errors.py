@@ -241,6 +241,8 @@ class SweepFault(StrEnum):
     BAD_RINGS = "bad_rings"
     """The beams cannot be told apart."""
     NO_FEATURES = "no_features"
+    REPEATED = "repeated"
+    """The points are those of the sweep before, though the lidar moves."""
     TOO_SOON = "too_soon"
     """The stamp follows the one before within a quarter of the usual interval, or of a sweep."""
     DUPLICATE_STAMP = "duplicate_stamp"

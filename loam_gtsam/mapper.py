@@ -32,7 +32,13 @@ from loam_gtsam.registration.relocalization import (
     placed,
     unplaced,
 )
-from loam_gtsam.registration.report import Clock, make_update, problem_of, status_of
+from loam_gtsam.registration.report import (
+    Clock,
+    checksum,
+    make_update,
+    problem_of,
+    status_of,
+)
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
 from loam_gtsam.registration.solvers.own_factors import (
     ExtraFactors,
@@ -87,19 +93,16 @@ class Mapper:
 
     Attributes
     ----------
-    last : the last update
-    registered : the last sweep as it went into the map; None if it did not
+    last, registered : the last update, and its sweep as it went into the map; None if it did not
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
     errors, point_times : calibrate the covariances, and ask whether points move as the lidar does
-    maps : the map of edges and that of planes
-    start : the first sweeps of a map; None once all are there
+    maps, start : the maps of edges and planes, and their first sweeps; None once all are there
 
     Raises
     ------
     InputError, ConfigError
-        If a part is none; if the IMU was made for other settings, or the configured solver has no
-        place for its factors or your own.
+        If a part is none, the IMU was made for other settings, or the solver takes no factors.
     """
 
     def __init__(
@@ -127,6 +130,7 @@ class Mapper:
         self.start: Start | None = None
         self._moment: Moment | None = None
         self._next: NextPiece | None = None
+        self._seen: int | None = None  # checksum of the last sweep
 
     def __getstate__(self) -> dict[str, Any]:
         # For checkpoints: no frame depends on what is only there to be looked at.
@@ -234,7 +238,8 @@ class Mapper:
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
         check_kind(features, Features, "features", "extract_features makes them of a Scan")
-        problem = problem_of(features)
+        problem = problem_of(features, self.last, self._seen)
+        self._seen = checksum(features)
         refused = self._refused(features.stamp, features.span[1] - features.span[0])
         return refused or (problem and self._unused(features.stamp, *problem))
 
@@ -246,8 +251,7 @@ class Mapper:
             return None
         if refusal.clock_step:
             self.last = replace(last, stamp=last.stamp + refusal.clock_step)
-            if self._moment is not None:
-                self._moment = self._moment._replace(stamp=self._moment.stamp + refusal.clock_step)
+            self._moment = self._moment and self._moment.later(refusal.clock_step)
             self.start, self._next = self.start and self.start.later(refusal.clock_step), None
             self.errors.cut(refusal.clock_step)
         bad, message, fault = FrameStatus.BAD_STAMP, refusal.message, refusal.fault
@@ -284,17 +288,18 @@ class Mapper:
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         accept(frame, found, self.monitor)
         scan = self.errors.of_scan(solution, posed.sweep, small=self.maps.small)
-        told = frame.matcher.last, solution, scan, frame.priors, found.beside_imu
+        told = self.imu, posed, frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)
+            posed, solution, pose, tilt, fused, unlike, said, more = with_imu(*told)
         if found.message or unlike:
             self.errors.jumped(frame.predicted, posed, solution.map_T_lidar, unlike=unlike)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
-        status, message = status_of(solution, found.message or self.point_times.problem or of_imu)
+        status, message = status_of(solution, found.message or self.point_times.problem or said)
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
-        update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
+        of_sweep = posed.sweep, solution, scan, last, fused, *rivals, more
+        update = self.errors.calibrated(update, *of_sweep)
         clock.lap("covariance")
         self._next = None
         return update

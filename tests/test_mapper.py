@@ -17,7 +17,14 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import imu_buffer
 from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
-from loam_gtsam.types import ConfigError, Features, FrameStatus, ImuSamples, TiltPrior
+from loam_gtsam.types import (
+    ConfigError,
+    Features,
+    FrameStatus,
+    ImuSamples,
+    SweepFault,
+    TiltPrior,
+)
 
 SECOND = 1_000_000_000
 
@@ -192,6 +199,25 @@ def test_no_features_predict_the_pose_and_leave_the_map(rng):
     assert mapper.maps.planes.count() == points
     expected = mapper.last.map_T_lidar.translation()
     np.testing.assert_allclose(expected, [0.4, 0.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize(("speed", "copies"), [(1.0, 2), (0.0, 2), (1.0, 0)])
+def test_a_copy_of_the_last_sweep_is_none_if_the_lidar_moves(rng, speed, copies):
+    """It would be found where the last one was; one that stands may see the same."""
+    mapper, features = Mapper(), room_features(gtsam.Pose3(), 0, rng)
+    for i in range(6):
+        pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * speed * i, 0.0, 0.0]))
+        stamp = i * SECOND // 10
+        if i in range(4, 4 + copies):
+            update = mapper.register(replace(features, stamp=stamp))
+            fault = SweepFault.REPEATED if speed else None
+            assert update.fault is fault
+            assert update.status.solved is (fault is None)
+        else:
+            features = room_features(pose, stamp, rng)
+            update = mapper.register(features, guess=pose if i < 4 else None)
+            assert update.status is (FrameStatus.OK if i else FrameStatus.FIRST)
+        assert update.map_T_lidar.equals(pose, 0.02)
 
 
 def test_sparse_map_inserts_at_the_guess(rng):

@@ -249,7 +249,7 @@ class ImuBuffer:
         if not self._quality.measured:
             samples = replace(samples, orientation=None)
         wrong = samples_problems(samples, self.config, rest)
-        return self._quality.report(samples.stamps, rest, filtered, wrong)
+        return self._quality.report(samples, rest, filtered, wrong)
 
     @property
     def measures_attitude(self) -> bool:

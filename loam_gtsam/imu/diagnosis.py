@@ -101,11 +101,13 @@ def samples_problems(
     if len(samples.stamps) < 2:
         return ()
     seconds = (samples.stamps - samples.stamps[0]) * 1e-9
-    force = _force(samples, seconds, config.gravity)
+    force = ""
+    if samples.acceleration.any():  # or there is no accelerometer
+        force = _force(samples, seconds, config.gravity) or _up_problem(samples, seconds, rest)
     found = (
         _frozen(samples, seconds),
         _orientation_problem(samples, seconds, config.max_gap),
-        force or _up_problem(samples, seconds, rest),
+        force,
     )
     return tuple(f"IMU: {problem}" for problem in found if problem)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.at_rest import REST_SAMPLES, RestWindow
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import FloatArray, ImuSamples, IntArray
 
 FROZEN_TURN = 0.2
 """rad/s; an orientation that never changes while the gyro measures more is a placeholder."""
@@ -97,16 +97,17 @@ class QualityLog:
         self._longest_gap = max(self._longest_gap, int(gaps.max(initial=0)))
 
     def report(
-        self, stamps: IntArray, rest: RestWindow | None, filtered: bool, wrong: Sequence[str] = ()
+        self, held: ImuSamples, rest: RestWindow | None, filtered: bool, wrong: Sequence[str] = ()
     ) -> ImuReport:
-        """The report on all samples so far.
+        """The report on all samples so far, of which some are ``held``.
 
-        ``stamps`` (N,) are of the samples held, ``rest`` is that at the start of the run,
-        ``filtered`` says whether there is an orientation at all, and ``wrong`` are the
-        problems of the values.
+        ``rest`` is that at the start of the run, ``filtered`` says whether there is an orientation
+        at all, and ``wrong`` are the problems of the values.
         """
-        samples, counts = self._dropped + len(stamps), self._counts
-        source, problem = self._source(samples, rest, filtered)
+        stamps, counts = held.stamps, self._counts
+        samples = self._dropped + len(stamps)
+        felt = bool(held.acceleration.any())  # else there is no accelerometer
+        source, problem = self._source(felt, rest, filtered)
         frozen = (
             f"IMU: the orientation never changes while the gyro says {self._fastest:.2g} rad/s: "
             "it is a placeholder and not used"
@@ -142,11 +143,11 @@ class QualityLog:
         steps = np.diff(stamps)
         return steps[steps > round(self._config.max_gap * 1e9)]
 
-    def _source(self, samples: int, rest: RestWindow | None, filtered: bool) -> tuple[str, str]:
+    def _source(self, felt: bool, rest: RestWindow | None, filtered: bool) -> tuple[str, str]:
         """Where the orientation comes from, and what is wrong with that, "" if nothing."""
         if self.measured:
             return "ahrs", ""
-        if not samples:
+        if not felt:
             return "none", ""
         if not filtered:
             return "none", (

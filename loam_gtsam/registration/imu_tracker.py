@@ -34,6 +34,7 @@ from loam_gtsam.types import ConfigError, FloatArray, TiltPrior, check_kind
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
 """Angle and share of the turn by which gyro and scan must differ to disagree: above all noise."""
+_LATELY = 5  # pairs of frames over which a gyro and the scans are held against each other
 _PAIRS = 2000  # number of pairs of frames, the newest, behind the check of the mounting
 _SURE = 4.2  # sigmas of one attitude: three of the difference of two
 
@@ -48,6 +49,7 @@ class Registration(NamedTuple):
     fused: Fused | None = None  # scan, gyro and accelerometer together; None if not
     contradicted: bool = False  # whether they predicted another pose
     problem: str = ""  # sentence for the user
+    turned: FloatArray | None = None  # (3,) rad/s that the gyro turned more than the last scans
 
 
 def with_imu(
@@ -71,6 +73,37 @@ def with_imu(
     return imu.add_scan(posed, last, solution, alone)
 
 
+class _Turns:
+    """How scans and gyro have turned between pairs of frames, the newest."""
+
+    def __init__(self) -> None:
+        self._spans = np.zeros((0, 2), np.int64)  # stamps
+        self._by_scan, self._by_gyro = np.zeros((2, 0, 3))
+
+    def add(self, span: tuple[int, int], by_scan: FloatArray, by_gyro: FloatArray) -> None:
+        """Add the turns (3,) between two stamps."""
+        self._spans = np.vstack([self._spans, span])[-_PAIRS:]
+        self._by_scan = np.vstack([self._by_scan, by_scan])[-_PAIRS:]
+        self._by_gyro = np.vstack([self._by_gyro, by_gyro])[-_PAIRS:]
+
+    @property
+    def more(self) -> FloatArray | None:
+        """(3,) rad/s, by which the gyro turned more than the last scans; None without any."""
+        if not len(self._spans):
+            return None
+        turned = (self._by_gyro - self._by_scan)[-_LATELY:].sum(axis=0)
+        more: FloatArray = turned / (1e-9 * float(np.diff(self._spans[-_LATELY:]).sum()))
+        return more
+
+    def problems(self, buffer: ImuBuffer, config: ImuConfig) -> tuple[str, ...]:
+        """See :func:`loam_gtsam.imu.diagnosis.scans_problems`."""
+        if not len(self._spans):
+            return ()
+        more = round((LATEST + 1.0) * 1e9)
+        samples = buffer.samples_between(self._spans.min() - more, self._spans.max() + more)
+        return scans_problems(self._spans, self._by_scan, self._by_gyro, samples, config)
+
+
 class ImuTracker:
     """The IMU's part in mapping, and what it has learnt from the frames so far.
 
@@ -92,7 +125,7 @@ class ImuTracker:
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
         self.gyro = GyroTrust()
-        self._spans, self._turns = np.zeros((0, 2), np.int64), np.zeros((0, 6))
+        self._turns = _Turns()
         self._coupling = TightCoupling(self.config)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -129,12 +162,7 @@ class ImuTracker:
     @property
     def problems(self) -> tuple[str, ...]:
         """What :func:`loam_gtsam.imu.diagnosis.scans_problems` says of the frames so far."""
-        if not len(self._spans):
-            return ()
-        more = round((LATEST + 1.0) * 1e9)
-        samples = self.buffer.samples_between(self._spans.min() - more, self._spans.max() + more)
-        turns = self._turns[:, :3], self._turns[:, 3:]
-        return scans_problems(self._spans, *turns, samples, self.config)
+        return self._turns.problems(self.buffer, self.config)
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps by the gyro; None while it is not to be trusted."""
@@ -228,8 +256,7 @@ class ImuTracker:
             return
         scan = last[1].rotation().between(now[1].rotation())
         by_scan, by_gyro = gtsam.Rot3.Logmap(scan), gtsam.Rot3.Logmap(turned)
-        self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
-        self._spans = np.vstack([self._spans, [last[0], now[0]]])[-_PAIRS:]
+        self._turns.add((last[0], now[0]), by_scan, by_gyro)
         agree = not _disagree(scan, turned, *_DISAGREEMENT)
         self.gyro.compared(agree=agree)
         if agree:
@@ -271,7 +298,8 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        return Registration(posed, solution, pose, tilt, fused, contradicted, self.gyro.problem)
+        told = fused, contradicted, self.gyro.problem, self._turns.more
+        return Registration(posed, solution, pose, tilt, *told)
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.

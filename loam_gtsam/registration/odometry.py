@@ -129,6 +129,10 @@ class Moment(NamedTuple):
         # The middles of two sweeps of different length may coincide.
         return max((stamp - self.stamp) * 1e-9, _SHORTEST)
 
+    def later(self, nanoseconds: int) -> Moment:
+        """The same on a clock that was set ahead by so much."""
+        return self._replace(stamp=self.stamp + nanoseconds)
+
     def twist_to(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6,) mean body velocity, rad/s and m/s, that leads to the middle of a later sweep."""
         way = gtsam.Pose3.Logmap(self.map_T_lidar.between(map_T_lidar))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from zlib import crc32
 
 import gtsam
 import numpy as np
@@ -11,6 +12,8 @@ import numpy as np
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import TANGENT, Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
+
+_STILL = 0.01  # metres or rad below which a lidar stands: a noise of zero leaves the points alike
 
 
 def make_update(
@@ -69,8 +72,14 @@ def make_update(
     )
 
 
-def problem_of(features: Features) -> tuple[str, SweepFault] | None:
-    """The reason why features cannot be used, as a sentence and as a fault; None if usable."""
+def problem_of(
+    features: Features, last: MapUpdate | None = None, before: int | None = None
+) -> tuple[str, SweepFault] | None:
+    """The reason why features cannot be used, as a sentence and as a fault; None if usable.
+
+    ``last`` is the update of the sweep before, and ``before`` its :func:`checksum`; None for the
+    first one. A lidar that stands may see the same once more.
+    """
     points = features.edges, features.planes, features.edge_times, features.plane_times
     told = features.edge_prominence, features.edge_sigmas  # infinite ones say something
     unknown = any(part is not None and np.isnan(part).any() for part in told)
@@ -78,7 +87,20 @@ def problem_of(features: Features) -> tuple[str, SweepFault] | None:
         return "features of the sweep are NaN or infinite", SweepFault.NOT_FINITE
     if not len(features.edges) + len(features.planes):
         return "the sweep has no features", SweepFault.NO_FEATURES
+    if last is not None and checksum(features) == before and _moves(last, features.stamp):
+        message = "the points are those of the sweep before, though the lidar moves: a copy of it"
+        return message, SweepFault.REPEATED
     return None
+
+
+def checksum(features: Features) -> int:
+    """A number that features of other points, but for one of 4 billion, do not have."""
+    return crc32(features.planes.tobytes(), crc32(features.edges.tobytes()))
+
+
+def _moves(last: MapUpdate, stamp: int) -> bool:
+    """Whether a lidar that goes on as in a sweep sees other points at the time of a stamp."""
+    return float(np.linalg.norm(last.twist)) * abs(stamp - last.stamp) * 1e-9 > _STILL
 
 
 def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:

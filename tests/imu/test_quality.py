@@ -19,3 +19,14 @@ def test_a_placeholder_is_not_taken_for_an_orientation():
         part(dataclasses.replace(moving(), orientation=identity), slice(9)),
     ):
         assert ImuBuffer(CONFIG, still).report.orientation == "ahrs"
+
+
+def test_of_an_imu_without_an_accelerometer_nothing_is_said_about_gravity():
+    with_gyro_alone = dataclasses.replace(moving(), orientation=None, acceleration=None)
+    report = ImuBuffer(CONFIG, with_gyro_alone).report
+    assert report.orientation == "none"
+    assert not report.problems
+    weak = dataclasses.replace(with_gyro_alone, acceleration=0.1 * moving().acceleration)
+    told = " ".join(ImuBuffer(CONFIG, weak).report.problems)
+    assert "none to be had from the acceleration" in told
+    assert "gravity has been taken off" in told or "multiples of gravity" in told

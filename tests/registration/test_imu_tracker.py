@@ -323,6 +323,16 @@ def test_the_bias_of_the_gyro_is_learnt():
     assert tracker.trusted_gyro is tracker.buffer
 
 
+def test_it_is_told_by_how_much_the_gyro_turned_more_than_the_last_scans():
+    tracker = turning_tracker((0.05, -0.1, 0.2))
+    tracker.first_pose(NOW, None)
+    assert tracker._turns.more is None
+    compare(tracker, frames((0.05, -0.1, 0.2), 20))
+    np.testing.assert_allclose(tracker._turns.more, 0.0, atol=1e-6)
+    compare(tracker, frames((0.03, -0.1, 0.21), 40)[20:])
+    np.testing.assert_allclose(tracker._turns.more, [0.02, 0.0, -0.01], atol=0.008)
+
+
 def test_a_gyro_that_turns_otherwise_is_given_up_after_five_frames_and_may_come_back():
     tracker = turning_tracker((0.0, 0.0, 0.8))
     tracker.first_pose(NOW, None)

@@ -256,7 +256,7 @@ class _Sweep:
 
 def own_errors(
     acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30, begins=0, known=None,
-    across=0.0, apart=1,
+    across=0.0, apart=1, turned=None,
 ):  # fmt: skip
     """Own error at the start of the last of many sweeps along x, accelerated after some.
 
@@ -268,7 +268,7 @@ def own_errors(
     accelerations = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
     errors = OwnErrors(config.imu.gyro_noise)
     drawn = np.zeros((6, 6))
-    drawn[4, 3] = across
+    drawn[4, [0, 3]] = across
     scan = ScanError(
         covariance, np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0,
         by_velocity=drawn, by_acceleration=0.1**2 / 24.0 * np.eye(6),
@@ -281,7 +281,7 @@ def own_errors(
         if errors.last is not None:
             accelerations.add(*errors.last, sweep.stamp, middle, covariance)
         update = MapUpdate(sweep.stamp, middle, FrameStatus.OK)
-        own = errors.of(update, sweep, middle, scan, accelerations, None).covariance
+        own = errors.of(update, sweep, middle, scan, accelerations, None, turned).covariance
     return own
 
 
@@ -338,6 +338,27 @@ def test_a_gyro_leaves_its_noise():
     expected = Config().imu.gyro_noise ** 2 * 0.05
     np.testing.assert_allclose(np.diag(own)[:3], expected, rtol=1e-9)
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
+
+
+def test_a_gyro_that_turns_unlike_the_scans_bends_the_sweep_and_leads_elsewhere():
+    more, none = np.array([0.04, 0.0, 0.0]), np.zeros((6, 6))
+    args = {"across": 0.02, "turned": more}
+    own, right, gyroless = (
+        own_errors(0.0, none, motion, **{**args, **changes})
+        for motion, changes in (
+            (SweepMotion.GYRO, {}),
+            (SweepMotion.GYRO, {"turned": np.zeros(3)}),
+            (SweepMotion.CONSTANT_VELOCITY, {}),
+        )
+    )
+    added = np.diag(own - right)
+    assert added[0] == pytest.approx((0.04 * 0.05) ** 2, rel=1e-6)
+    assert added[4] == pytest.approx((0.04 * 0.02) ** 2, rel=0.05)
+    np.testing.assert_array_equal(gyroless, own_errors(0.0, none, across=0.02))
+    # What the noise of two scans, 0.1 s apart, makes of it is no sign of anything.
+    noisy = np.diag([0.04**2 * 0.1**2 / 2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    quiet = own_errors(0.0, noisy, SweepMotion.GYRO, **args)
+    np.testing.assert_allclose(quiet, own_errors(0.0, noisy, SweepMotion.GYRO), atol=1e-12)
 
 
 def calibrated(errors, number, map_T_lidar=None, twist=None, x=0.0, last=None, **more):

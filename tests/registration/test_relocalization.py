@@ -608,15 +608,40 @@ def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, mon
     assert rivals == ([] if objects else places[1:])  # the first is the same place
 
 
-@pytest.mark.parametrize(("metres", "place"), [(0.2, 0), (3.0, -1)])
+@pytest.mark.parametrize(("metres", "place"), [(0.2, 0), (3.0, -1), (8.0, None)])
 def test_a_drive_is_the_likeliest_motion_unless_no_acceleration_leads_there(
     metres, place, before, calm
 ):
+    """At 80 m/s it is none."""
     frame = frame_of(before, list(calm)[AT])
     there = frame.predicted.map_T_middle.compose(gtsam.Pose3(gtsam.Rot3(), [metres, 0.0, 0.0]))
     motions = doubtful_sweeps._motions(frame, there, np.zeros(6))
+    if place is None:
+        assert len(motions) == 3
+        assert max(np.linalg.norm(motion[3:]) for motion in motions) < 5.0
+        return
     assert len(motions) == 4
     np.testing.assert_array_equal(motions[place], frame.matcher.twist_to(there))
+
+
+def test_the_matches_of_a_far_place_tell_no_speed_that_nothing_has(before, calm, monkeypatch):
+    """What they leave open would be as fast as a drive there."""
+    frame, monitor = frame_of(before, list(calm)[AT]), deepcopy(before.monitor)
+    solution, asked = frame.solve(before.solver), []
+    free = replace(frame.matcher, accelerations=before.errors.accelerations)
+    frame = replace(frame, matcher=free)
+    assert frame.matcher.motion_is_free
+    monkeypatch.setattr(doubtful_sweeps, "CLEARLY", 0.0)  # the last that is tried is taken
+    monkeypatch.setattr(
+        doubtful_sweeps, "_tried", lambda *_: (Fit(1.0, 1.0), asked[-1], frame.matcher.posed)
+    )
+    for metres, told in ((0.2, True), (8.0, False)):
+        far = frame.matcher.last.map_T_lidar.compose(gtsam.Pose3(gtsam.Rot3(), [metres, 0, 0]))
+        asked.append(replace(solution, map_T_lidar=far))
+        found = doubtful_sweeps._with_motion(
+            frame, far, [np.zeros(6)], monitor, before.solver, told=True
+        )
+        assert (found.posed is not frame.matcher.posed) is told
 
 
 def test_in_a_dense_map_a_match_that_any_place_would_agree_with_says_nothing(before, calm):

@@ -18,6 +18,7 @@ from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AGREE,
     AS_WELL,
+    FASTEST,
     Fit,
     FitMonitor,
     beyond_any_motion,
@@ -331,9 +332,9 @@ def _speaks_for(matcher: FrameMatcher, one: Solution, other: Solution) -> bool:
 def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatArray]:
     """The (6,) velocities with which a sweep may have been taken at a place, the likeliest first.
 
-    They are that of a drive to the place, the predicted one, an ``other`` one, and the predicted
-    one in axes that were turned on the vehicle. If no acceleration leads to the place,
-    the lidar was carried there between two sweeps, and a drive is the least likely.
+    They are that of a drive to the place, if any car is as fast, the predicted one, an ``other``
+    one, and the predicted one in axes that were turned on the vehicle. If no acceleration leads to
+    the place, the lidar was carried there between two sweeps, and a drive is the least likely.
     """
     matcher, expected = frame.matcher, frame.predicted.map_T_middle
     steady, last = matcher.posed.twist, matcher.last
@@ -342,7 +343,9 @@ def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatA
     if last is not None and last.solved:
         step, seconds = expected.localCoordinates(place), last.seconds_to(frame.sweep.stamp)
         carried = beyond_any_motion(step, seconds, matcher.config.relocalization)
-        twists.insert(len(twists) if carried else 0, matcher.twist_to(place))
+        drive = matcher.twist_to(place)
+        if np.linalg.norm(drive[3:]) < FASTEST:
+            twists.insert(len(twists) if carried else 0, drive)
     return twists if frame.sweep.duration > 0.0 else twists[:1]
 
 
@@ -360,7 +363,8 @@ def _with_motion(
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
     if told and matcher.motion_is_free:
         fit, near, _ = _tried(frame, matcher, place, solver)
-        tried.append((fit, near, frame.posed_for(near)))
+        if np.linalg.norm(matcher.twist_to(near.map_T_lidar)[3:]) < FASTEST:
+            tried.append((fit, near, frame.posed_for(near)))
     for fit, found, posed in tried:
         if not (found.solved and monitor.fits_again(fit)):
             continue

@@ -26,6 +26,7 @@ _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
 AS_WELL = 0.75
 """Part of the best place's fit from which another place fits as well, but for chance: of 200
 matches, half of which agree, three standard deviations."""
+FASTEST = 50.0  # m/s, 180 km/h: largest speed that a place on trial may lead to
 _OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level; slopes are

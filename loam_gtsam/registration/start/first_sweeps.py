@@ -28,7 +28,7 @@ from loam_gtsam.registration.relocalization import (
     same,
     sample_features,
 )
-from loam_gtsam.registration.relocalization.fits import APART
+from loam_gtsam.registration.relocalization.fits import APART, FASTEST
 from loam_gtsam.registration.relocalization.likely_poses import MORE_EDGES
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.registration.solvers.own_factors import NamedSolver
@@ -76,7 +76,6 @@ follow something one more is told, and the eighth sweep of a corridor takes half
 _LESS = 1.0
 """Standard deviations by which few matches may speak less for one of these. Against boxes that were
 followed what stood had 0.4 less at most; in the right map places a metre off have one to three."""
-_FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
 _KNOWN_TURN = np.diag(np.repeat([np.radians(0.3) ** -2, 0.0], 3))
 """Information of the rotation between two sweeps by a gyro: above its noise and its bias."""
@@ -136,7 +135,7 @@ class Start:
         second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, *told)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
-        within = min(_FASTEST * seconds, _FARTHEST), _TURNING * seconds
+        within = min(FASTEST * seconds, _FARTHEST), _TURNING * seconds
         places = _likely(first, second, centres, _PLACES, within)
         ways = _ways(early, first, second, places)
         turned = _turned(frame, first, imu)

@@ -87,11 +87,13 @@ class OwnErrors:
         scan: ScanError,
         motion: Accelerations,
         fused: Fused | None,
+        turned: FloatArray | None = None,
     ) -> OwnError:
         """The own error of a frame, each in turn.
 
         That of its ``scan`` is at the pose of the ``middle``; ``fused`` is the pose by scan and IMU
-        together, None if there is none.
+        together, None if there is none. The gyro has ``turned`` by (3,) rad/s more than the last
+        scans, None if there is none.
         """
         last = self._last
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
@@ -102,6 +104,8 @@ class OwnErrors:
                 own = own + _changed(update.twist, sweep, motion.variances)
         else:
             now, own, shared = self._by_imu(now, sweep, motion, fused, update)
+        if turned is not None and last is not None and sweep.motion is SweepMotion.GYRO:
+            own = own + _turned_unlike(turned, sweep, scan, now, last)
         self._last, self._paused, self._strayed = now, False, np.zeros(6)
         follows = None if last is None else last.reference_stamp
         return OwnError(symmetric(own), to_reference, shared, follows)
@@ -182,6 +186,26 @@ class OwnErrors:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
         covariance: FloatArray = drawn * variances @ drawn.T + np.diag(noise)
         return covariance
+
+
+def _turned_unlike(
+    turned: FloatArray, sweep: MovingSweep, scan: ScanError, now: _Middle, last: _Middle
+) -> FloatArray:
+    """(6, 6) covariance of what a gyro that turns by (3,) rad/s more than the scans does to a pose.
+
+    It has bent the sweep, and led from the middle to the reference time. What the errors of both
+    scans make of such a difference does not count.
+    """
+    seconds = (now.stamp - last.stamp) * 1e-9
+    if seconds <= 0.0:  # sweeps of different length
+        return np.zeros((6, 6))
+    noise = sum(float(np.trace(one.covariance[:3, :3])) for one in (now, last)) / seconds**2
+    squared = float(turned @ turned)
+    off = turned * np.sqrt(max(1.0 - noise / squared, 0.0)) if squared > 0.0 else turned
+    bent, led = scan.by_velocity[:, :3] @ off, np.append(sweep.middle * off, np.zeros(3))
+    to_reference = now.to_reference
+    moved: FloatArray = to_reference @ (np.outer(bent, bent) + np.outer(led, led)) @ to_reference.T
+    return moved
 
 
 def unresolved(seconds: float, duration: float) -> tuple[float, float]:

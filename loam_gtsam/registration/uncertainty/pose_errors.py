@@ -144,6 +144,7 @@ class PoseErrors:
         fused: Fused | None = None,
         doubt: FloatArray | None = None,
         parting: FloatArray | None = None,
+        turned: FloatArray | None = None,
     ) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
 
@@ -151,7 +152,8 @@ class PoseErrors:
         the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
         and IMU together; ``doubt`` is a further covariance (6, 6) of the pose, map frame, until the
         start of the run is over, and None from then on; ``parting`` is the mean square (6, 6) of a
-        velocity at which the pose may go on elsewhere, rad/s and m/s, told with these.
+        velocity at which the pose may go on elsewhere, rad/s and m/s, told with these; ``turned``
+        is what a gyro has turned more than the scans, (3,) rad/s.
         """
         self._found = update
         if scan is None:
@@ -165,7 +167,7 @@ class PoseErrors:
         if fused is not None:
             self._map.set_velocity(middle.rotation().unrotate(fused.velocity))
         self._add_acceleration(sweep, middle, known, last)
-        own = self._own.of(update, sweep, middle, scan, self._motion, by_imu)
+        own = self._own.of(update, sweep, middle, scan, self._motion, by_imu, turned)
         if self._scans == 1:
             self._map.set_origin(sweep, scan, middle, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)

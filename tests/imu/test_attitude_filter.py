@@ -75,7 +75,8 @@ def test_an_acceleration_that_is_not_gravity_gives_no_orientation():
         assert (buffer.orientation(int(ns(1.0))) is None) is (source == "none")
         assert buffer.rotations_since(int(ns(1.0)), np.array([0.1])) is not None
         if source == "none":
-            assert "is not near 9.81 m/s^2" in buffer.report.problems[0]
+            said = "".join(buffer.report.problems)  # nothing of an accelerometer that is not there
+            assert ("is not near 9.81 m/s^2" in said) is (factor > 0.0)
             assert buffer.samples_between(START, START + 10**9).orientation is None
 
 

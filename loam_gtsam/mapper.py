@@ -291,7 +291,7 @@ class Mapper:
         told = self.imu, posed, frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, said, more = with_imu(*told)
-        if found.message or unlike:
+        if found.message or found.in_vain or unlike:
             self.errors.jumped(frame.predicted, posed, solution.map_T_lidar, unlike=unlike)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)

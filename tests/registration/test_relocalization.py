@@ -562,7 +562,20 @@ def test_what_is_in_doubt_is_believed_elsewhere_only_if_its_features_say_so(befo
     assert found.message.startswith("relocalised")
     assert found.solution.map_T_lidar.equals(solution.map_T_lidar, 1e-2)
     kept = search(frame, solution, monitor, before.solver, Doubt.OPTIMUM)
-    assert (kept.solution, kept.message) == (solution, "")
+    assert (kept.solution, kept.message, kept.in_vain) == (solution, "", True)
+
+
+@pytest.mark.parametrize(("doubt", "told"), [(None, 0), (Doubt.OPTIMUM, 1)])
+def test_what_was_looked_for_elsewhere_in_vain_may_have_jumped(
+    doubt, told, before, calm, monkeypatch
+):
+    """It fits unusually little where it is, and nobody knows of a better place."""
+    mapper, asked = deepcopy(before), []
+    mapper.errors.jumped = lambda *_, **__: asked.append(1)
+    monkeypatch.setattr(doubtful_sweeps, "doubtful", lambda *_: doubt)
+    update = mapper.register(extract_features(list(calm)[AT], mapper.config))
+    assert (update.status, update.message) == (FrameStatus.OK, "")
+    assert len(asked) == told
 
 
 def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm):

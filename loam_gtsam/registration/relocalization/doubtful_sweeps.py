@@ -64,6 +64,7 @@ class Found:
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
     parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
     led: FloatArray | None = None  # (6,) velocity that led to the pose, if the sweep keeps another
+    in_vain: bool = False  # whether it was looked for elsewhere, as it fits unusually little here
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
 
 
@@ -230,6 +231,7 @@ def search(
     stays, found = found_at(frame, solution), None
     if doubt is Doubt.OPTIMUM or monitor.unusual(Fit.of(solution.matches, matcher.offered)):
         found = _elsewhere(frame, solution, monitor, solver, stays)
+        stays = replace(stays, in_vain=True)
     if found is None and doubt is Doubt.JUMP:
         found = _as_before(frame, stays, monitor, solver)
     matcher.clock.lap("relocalize")

@@ -70,6 +70,7 @@ SPOILT: Mapping[str, tuple[str, Callable[[Scan, Rng], Sweep]]] = {
 
 DELIVERY: Mapping[str, tuple[int, Mapping[str, int], int]] = {
     "delivered twice": (1, {"duplicate_stamp": 1}, 0),
+    "the last one in its stead": (1, {"repeated": 1}, 0),
     "too soon after the last": (1, {"too_soon": 1}, 1),
     "two in the wrong order": (2, {"late": 1}, 1),
     "three sweeps late": (4, {"late": 1}, 1),
@@ -180,6 +181,10 @@ class FaultyDrive:
             off = -int(rng.integers(80_000_000, 99_000_000))  # of 100 ms
         elif kind == "clock back for eight sweeps":
             off = -int(rng.integers(HOUR, DAY))
+        if kind == "the last one in its stead":
+            copied = self._sweep(first - 1, shift)
+            yield replace(copied, stamp=self._sweep(first, shift).stamp), first
+            return
         for number in (first + step for step in order):
             yield self._sweep(number, shift + off), number
 

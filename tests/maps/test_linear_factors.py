@@ -199,7 +199,7 @@ def test_factors_on_what_is_not_there_are_refused(driven: Driven, name: str, wro
         graph_of_arrays(arrays)
 
 
-CUTS = (0, 35), (25, 60)
+CUTS = (0, 36), (24, 60)
 _CONFIG = QUICK.changed("pose_graph.keyframe_distance=0.5", "loops.enabled=true")
 
 

@@ -105,7 +105,7 @@ def test_long_runs_are_adjusted_in_windows_each_of_one_run(two, refined) -> None
     assert windows == [(1, 4), (2, 4), (3, 4), (4, 4)]  # 24 and 11 sweeps of each
     ways = [[one.trajectory for one in of] for of in (refined, found)]
     whole, parts = (rms(np.concatenate(two.errors(of))) for of in ways)
-    assert parts < 1.4 * whole
+    assert parts < 1.5 * whole
 
 
 def with_loop(graph: SavedGraph, earlier: int, later: int, beside: float) -> SavedGraph:

@@ -30,6 +30,7 @@ _ADVICE = {
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _PIECE = " in another piece of map"  # in the message of the first frame there
+_MOVED = "moved by "  # in the message of a frame that was searched for
 _VAGUE = 0.01  # standard deviation from which on a pose is vague: rad, and part of the path
 _SAID = 1.0  # metres of standard deviation from which on a vague one is said
 _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground makes
@@ -43,9 +44,7 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
     if sigmas is not None:
         largest = sigmas["largest"]
         if largest > max(_SAID, _VAGUE * path):
-            told = f"positions are told to {largest:.2g} m at worst (sigma)"
-            why = "other first motions fit as well, or the way was blind or is missing"
-            notes.append(f"{told}: {why}")
+            notes.append(_why_vague(result.updates, largest))
     pieces = [number for number, one in enumerate(result.updates) if _PIECE in one.message]
     if pieces:
         frames = ", ".join(map(str, pieces))
@@ -62,6 +61,19 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
     if result.range_offset is not None and result.range_offset.problem:
         notes.append(result.range_offset.problem)
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
+
+
+def _why_vague(updates: Sequence[MapUpdate], largest: float) -> str:
+    """A sentence on the largest standard deviation of a position, metres, and whence it comes."""
+    squares = [np.trace(one.covariance[3:, 3:]) if one.status.solved else 0.0 for one in updates]
+    since = int(np.argmax(np.nan_to_num(squares) >= 0.5 * largest**2))
+    why = "other first motions fit as well, or the way was blind or is missing"
+    if _MOVED in updates[since].message:
+        why = "it was found where no motion had led, and another place may look like that"
+    return (
+        f"positions are told to {largest:.2g} m at worst (sigma), to most of it from frame "
+        f"{since} on: {why}"
+    )
 
 
 def _on_statuses(updates: Sequence[MapUpdate], path: float) -> list[str]:

@@ -286,6 +286,25 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
 
 
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        ("relocalised, moved by 9.00 m and 0.1 degrees", "found where no motion had led"),
+        ("", "other first motions fit as well"),
+    ],
+)
+def test_since_when_and_why_positions_are_vague_is_said(result, message, why):
+    vague = np.diag([0.0, 0.0, 0.0, 4.0, 0.0, 0.0])
+    updates = [
+        replace(one, covariance=one.covariance + (number >= 5) * vague, message="")
+        for number, one in enumerate(result.updates)
+    ]
+    updates[5] = replace(updates[5], message=message)
+    (note,) = replace(result, updates=tuple(updates)).notes
+    assert note.startswith("positions are told to 2 m at worst (sigma), to most of it from frame 5")
+    assert why in note
+
+
 def test_fixes_that_were_asked_for_and_not_used_are_a_note(result):
     fixes = GnssFixes(WORLD.truth.stamps, [[47.5, 8.5, 450.0]] * len(WORLD.truth))
     config = Config().changed("aiding.gnss=true")

@@ -484,6 +484,9 @@ def test_a_scan_that_leads_away_from_the_imu_is_solved_beside_it(
     frame = replace(frame, predicted=replace(frame.predicted, motion=told))
     found = doubtful_sweeps._solved(frame, solver)
     assert found.beside_imu is beside
+    config = frame.matcher.config.changed("solver.method=loam", "imu.prior=off")
+    classical = replace(frame, matcher=replace(frame.matcher, config=config))
+    assert not doubtful_sweeps._solved(classical, solver).beside_imu
     if not beside:
         assert found.solution.map_T_lidar.equals(frame.solve(solver).map_T_lidar, 1e-9)
         return

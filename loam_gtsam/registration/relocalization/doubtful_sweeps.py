@@ -187,10 +187,11 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
 
     Where much repeats, as on stairs, features that belong to what is not mapped yet match what is
     next to it, and lead there. If the IMU is right, what is matched where it has the sweep leads
-    nowhere else, and fits as well. Where the same matches agree, it is no other place.
+    nowhere else, and fits as well. Where the same matches agree, it is no other place. A classical
+    solver has no place for what the IMU says.
     """
     alone, matcher, expected = frame.solve(solver), frame.matcher, frame.predicted.motion
-    if not contradicts(expected, alone):
+    if matcher.config.solver.method != "gtsam" or not contradicts(expected, alone):
         return found_at(frame, alone)
     prior = SCAN_VARIANCE * expected.information  # as that of the matches beside it
     both = frame.solve(solver, [replace(expected, information=prior).factor()])
@@ -294,11 +295,8 @@ def _elsewhere(
     first = next(filter(None, near), None)
     if first is None:
         return None
-    matcher, others = (
-        frame.matcher.moving_at(first.posed.twist),
-        _others(frame, first, places, solver),
-    )
-    found = first
+    matcher, found = frame.matcher.moving_at(first.posed.twist), first
+    others = _others(frame, first, places, solver)
     for there in others:
         if _speaks_for(matcher, there, first.solution):
             found = fitting(there.map_T_lidar, found) or found

@@ -20,8 +20,8 @@ _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NOT_CONVERGED)
 _TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
 _PARTS = slice(0, 3), slice(3, 6)  # of a covariance: rotation and position
 _ADVICE = {
-    FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
-    "docs/imu.md, docs/gnss.md",
+    FrameStatus.DEGENERATE: "a sensor that the run does without (of IMU, wheels, GPS) can tell "
+    "what the scans do not: docs/imu.md, docs/gnss.md",
     FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
     "of the points",
     FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",

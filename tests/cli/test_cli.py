@@ -184,7 +184,7 @@ def test_poses_that_no_scan_fixes_are_told_in_one_line():
         "run", "sim:open_field?frames=4&columns=300", "--output", "field", "--no-plot", *QUICK_START
     )
     told = "DO NOT TRUST THIS RUN: 3 of 4 poses (75 %) are not fixed by their scans (3 degenerate)"
-    assert f"{told}, first that of frame 1; another sensor" in text
+    assert f"{told}, first that of frame 1; a sensor that the run does without" in text
     assert "weakly constrained: x, y, rz (3 directions)" in text
     assert "positions are told to" in text
     assert "rz in 3 frames, x in 3 frames, y in 3 frames (axes of the lidar)" in text

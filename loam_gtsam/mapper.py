@@ -292,7 +292,8 @@ class Mapper:
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, said, more = with_imu(*told)
         if found.message or found.in_vain or unlike:
-            self.errors.jumped(frame.predicted, posed, solution.map_T_lidar, unlike=unlike)
+            step = frame.predicted, posed, solution.map_T_lidar
+            self.errors.jumped(*step, unlike=unlike, searched=found.searched)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.message or self.point_times.problem or said)

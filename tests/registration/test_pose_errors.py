@@ -515,6 +515,24 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     assert np.abs(relative_covariance(after, later)).max() < 0.1
 
 
+@pytest.mark.parametrize(("searched", "inertial"), [(10.0, False), (0.0, False), (10.0, True)])
+def test_what_was_looked_for_in_vain_may_be_farther_off(searched, inertial, monkeypatch):
+    """Even if it has moved little; but not if gyro and accelerometer know where it is."""
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors = PoseErrors(Config())
+    before = [calibrated(errors, k) for k in range(6)][-1]
+    posed = PosedSweep(SimpleNamespace(stamp=before.stamp + FRAME), np.zeros(6))
+    told = SimpleNamespace(covariance_in_map=1e-4 * np.eye(6)) if inertial else None
+    expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed, inertial=told)
+    found = gtsam.Pose3(gtsam.Rot3(), [0.4, 0.0, 0.0])
+    errors.jumped(
+        expected, replace(posed, twist=np.ones(6)), found, unlike=False, searched=searched
+    )
+    added = np.diag(calibrated(errors, 6, found).uncertainty.drift - before.uncertainty.drift)
+    assert np.sqrt(added[3:]).max() < 0.3 if inertial or not searched else added[4] > 49.0
+
+
 def test_a_guess_that_led_elsewhere_is_no_error_of_the_map(monkeypatch):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)

@@ -581,8 +581,8 @@ def test_what_was_looked_for_elsewhere_in_vain_may_have_jumped(
     assert len(asked) == told
 
 
-def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm):
-    """If it fits as usual, only its motion is another one."""
+def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm, monkeypatch):
+    """In vain it may be anywhere else. If it fits as usual, only its motion is another one."""
     frame = frame_of(before, list(calm)[AT])
     solution, monitor = frame.solve(before.solver), deepcopy(before.monitor)
     wrong = replace(solution, map_T_lidar=solution.map_T_lidar.retract([0, 0, 0.2, 0, 0, 0]))
@@ -591,9 +591,13 @@ def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm):
     found = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
     assert found.message.startswith("relocalised")
     assert found.solution.map_T_lidar.equals(solution.map_T_lidar, 1e-2)
+    monkeypatch.setattr(doubtful_sweeps, "_elsewhere", lambda *_: None)
+    kept = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
+    assert (kept.in_vain, kept.searched) == (True, monitor.radius)
     monitor.unusual = lambda fit: False
     kept = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
     assert not kept.message.startswith("relocalised")
+    assert (kept.in_vain, kept.searched) == (False, 0.0)
 
 
 def test_of_places_where_a_sweep_fits_again_its_features_choose(before, calm, monkeypatch):

@@ -65,6 +65,7 @@ class Found:
     parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
     led: FloatArray | None = None  # (6,) velocity that led to the pose, if the sweep keeps another
     in_vain: bool = False  # whether it was looked for elsewhere, as it fits unusually little here
+    searched: float = 0.0  # metres around, in which that was, if no acceleration leads here
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
 
 
@@ -232,7 +233,8 @@ def search(
     stays, found = found_at(frame, solution), None
     if doubt is Doubt.OPTIMUM or monitor.unusual(Fit.of(solution.matches, matcher.offered)):
         found = _elsewhere(frame, solution, monitor, solver, stays)
-        stays = replace(stays, in_vain=True)
+        searched = monitor.radius if doubt is Doubt.JUMP else 0.0
+        stays = replace(stays, in_vain=True, searched=searched)
     if found is None and doubt is Doubt.JUMP:
         found = _as_before(frame, stays, monitor, solver)
     matcher.clock.lap("relocalize")
@@ -249,7 +251,7 @@ def _as_before(
     if found is None or matcher.last is None or found.posed.twist is jumped.posed.twist:
         return None
     led = matcher.last.twist_to(frame.sweep.stamp, found.solution.map_T_lidar)
-    return replace(found, led=led)
+    return replace(found, led=led, in_vain=jumped.in_vain, searched=jumped.searched)
 
 
 def _lost(frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver) -> Lost:

@@ -202,22 +202,25 @@ class PoseErrors:
             self._motion.add(*before, sweep.stamp, middle, known)
 
     def jumped(
-        self, expected: Prediction, posed: PosedSweep, pose: gtsam.Pose3, *, unlike: bool
-    ) -> None:
+        self, expected: Prediction, posed: PosedSweep, pose: gtsam.Pose3, *, unlike: bool,
+        searched: float = 0.0,
+    ) -> None:  # fmt: skip
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
         If no usual acceleration leads there, it may only look alike. An IMU to which it is
         ``unlike`` knew better; a user's guess that led away from it did not. A sweep that is
-        ``posed`` with the expected motion was hardly taken in that.
+        ``posed`` with the expected motion was hardly taken in that. One to which no acceleration
+        leads, and that fits unusually little, may be farther off than it was ``searched``, metres.
         """
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step, gap = before.localCoordinates(pose), self.gap
-        if unlike or not (same(before, pose) or self._motion.explains(step, now)):
+        usual = same(before, pose) or self._motion.explains(step, now)
+        if unlike or searched > 0.0 or not usual:
             missed, inertial = np.zeros((6, 6)), None if unlike else expected.inertial
             if inertial is not None:
                 missed = inertial.covariance_in_map
             elif gap is not None:
-                missed = gap.bridged(now, posed.twist)[1]
+                missed = gap.bridged(now, posed.twist)[1] + _anywhere_near(pose, searched)
                 if expected.inertial is None:
                     steady = gap.steady(now).localCoordinates(pose)
                     step = min(step, steady, key=lambda way: float(np.linalg.norm(way[3:])))
@@ -243,3 +246,9 @@ class PoseErrors:
         """Start anew in time: the next frame is on a clock that was set ahead, nanoseconds."""
         self._own.cut(paused=True)
         self._map.cut(ahead)
+
+
+def _anywhere_near(pose: gtsam.Pose3, metres: float) -> FloatArray:
+    """Covariance (6, 6) on the left, in map axes, of a pose whose position is known to so much."""
+    to_map: FloatArray = pose.AdjointMap()[:, 3:] * metres
+    return to_map @ to_map.T

@@ -32,13 +32,7 @@ from loam_gtsam.registration.relocalization import (
     placed,
     unplaced,
 )
-from loam_gtsam.registration.report import (
-    Clock,
-    checksum,
-    make_update,
-    problem_of,
-    status_of,
-)
+from loam_gtsam.registration.report import Clock, checksum, make_update, problem_of, status_of
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
 from loam_gtsam.registration.solvers.own_factors import (
     ExtraFactors,
@@ -238,8 +232,8 @@ class Mapper:
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
         check_kind(features, Features, "features", "extract_features makes them of a Scan")
-        problem = problem_of(features, self.last, self._seen)
-        self._seen = checksum(features)
+        before, self._seen = self._seen, checksum(features)
+        problem = problem_of(features, self.last if self._seen == before else None)
         refused = self._refused(features.stamp, features.span[1] - features.span[0])
         return refused or (problem and self._unused(features.stamp, *problem))
 

@@ -72,13 +72,11 @@ def make_update(
     )
 
 
-def problem_of(
-    features: Features, last: MapUpdate | None = None, before: int | None = None
-) -> tuple[str, SweepFault] | None:
+def problem_of(features: Features, alike: MapUpdate | None = None) -> tuple[str, SweepFault] | None:
     """The reason why features cannot be used, as a sentence and as a fault; None if usable.
 
-    ``last`` is the update of the sweep before, and ``before`` its :func:`checksum`; None for the
-    first one. A lidar that stands may see the same once more.
+    ``alike`` is the update of the sweep before, if that had the same points: a lidar that stands
+    may see the same once more.
     """
     points = features.edges, features.planes, features.edge_times, features.plane_times
     told = features.edge_prominence, features.edge_sigmas  # infinite ones say something
@@ -87,7 +85,7 @@ def problem_of(
         return "features of the sweep are NaN or infinite", SweepFault.NOT_FINITE
     if not len(features.edges) + len(features.planes):
         return "the sweep has no features", SweepFault.NO_FEATURES
-    if last is not None and checksum(features) == before and _moves(last, features.stamp):
+    if alike is not None and _moves(alike, features.stamp):
         message = "the points are those of the sweep before, though the lidar moves: a copy of it"
         return message, SweepFault.REPEATED
     return None

@@ -623,8 +623,8 @@ def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, mon
         solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start)
     )
     monkeypatch.setattr(doubtful_sweeps, "_speaks_for", lambda *_: objects)
-    others = doubtful_sweeps._others(frame, found, places, solver)
-    rivals = doubtful_sweeps._rivals(frame, found, others)
+    matcher, others = doubtful_sweeps._others(frame, found, places, solver)
+    rivals = doubtful_sweeps._rivals(matcher, found, others)
     assert rivals == ([] if objects else places[1:])  # the first is the same place
 
 

@@ -24,4 +24,5 @@ from loam_gtsam.registration.relocalization.next_piece import CONTINUED as CONTI
 from loam_gtsam.registration.relocalization.next_piece import Gap as Gap
 from loam_gtsam.registration.relocalization.next_piece import NextPiece as NextPiece
 from loam_gtsam.registration.relocalization.next_piece import goes_on as goes_on
+from loam_gtsam.registration.relocalization.next_piece import spread_in_map as spread_in_map
 from loam_gtsam.registration.relocalization.places import any_of as any_of

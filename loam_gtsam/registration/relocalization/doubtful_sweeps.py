@@ -283,51 +283,51 @@ def _elsewhere(
     place is taken in its stead if they speak for that one.
     """
     places = likely_places(frame, solution, monitor, solver)
-    other = np.zeros(6) if stays is None else stays.posed.twist
+    other_twist = np.zeros(6) if stays is None else stays.posed.twist
 
     def fitting(place: gtsam.Pose3, rival: Found | None) -> Found | None:
-        twists = _motions(frame, place, other)
+        twists = _motions(frame, place, other_twist)
         found = _with_motion(frame, place, twists, monitor, solver, told=True)
         if found is None or rival is None:
             return found
         matcher = frame.matcher.moving_at(found.posed.twist)
-        return found if _speaks_for(matcher, found.solution, rival.solution) else None
+        here = Evidence.of(matcher, found.solution, dense=True)
+        return found if _speaks_for(here, rival.solution, matcher) else None
 
     near = (fitting(place, stays) for place in places[: 1 if monitor.lost else _CLOSER])
     first = next(filter(None, near), None)
     if first is None:
         return None
-    matcher, found = frame.matcher.moving_at(first.posed.twist), first
-    others = _others(frame, first, places, solver)
-    for there in others:
-        if _speaks_for(matcher, there, first.solution):
-            found = fitting(there.map_T_lidar, found) or found
+    found, (matcher, others) = first, _others(frame, first, places, solver)
+    for other in others:
+        if _speaks_for(Evidence.of(matcher, other, dense=True), first.solution, matcher):
+            found = fitting(other.map_T_lidar, found) or found
     if found is not first:
-        others = _others(frame, found, places, solver)
-    doubt = any_of(found.solution.map_T_lidar, _rivals(frame, found, others))
+        matcher, others = _others(frame, found, places, solver)
+    doubt = any_of(found.solution.map_T_lidar, _rivals(matcher, found, others))
     after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
     return replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=doubt)
 
 
 def _others(
     frame: Frame, found: Found, places: Sequence[gtsam.Pose3], solver: ScanSolver
-) -> list[Solution]:
-    """The sweep as solved near other places than the one where it was found."""
+) -> tuple[FrameMatcher, list[Solution]]:
+    """The sweep as solved near other places than the one where it was found, and its matcher."""
     matcher, here = frame.matcher.moving_at(found.posed.twist), found.solution.map_T_lidar
     away = (place for place in places if not same(place, here))
     solved = (solved_near(frame, matcher, place, solver) for place in away)
-    return [one for one in solved if one.solved]
+    return matcher, [one for one in solved if one.solved]
 
 
-def _rivals(frame: Frame, found: Found, others: Sequence[Solution]) -> list[gtsam.Pose3]:
+def _rivals(matcher: FrameMatcher, found: Found, others: Sequence[Solution]) -> list[gtsam.Pose3]:
     """Other places to which the features of a sweep that was found do not object."""
-    matcher = frame.matcher.moving_at(found.posed.twist)
-    return [one.map_T_lidar for one in others if not _speaks_for(matcher, found.solution, one)]
+    here = Evidence.of(matcher, found.solution, dense=True)
+    return [one.map_T_lidar for one in others if not _speaks_for(here, one, matcher)]
 
 
-def _speaks_for(matcher: FrameMatcher, one: Solution, other: Solution) -> bool:
+def _speaks_for(here: Evidence, other: Solution, matcher: FrameMatcher) -> bool:
     """Whether the features of a matcher speak for a place against another one, beyond chance."""
-    here, there = (Evidence.of(matcher, place, dense=True) for place in (one, other))
+    there = Evidence.of(matcher, other, dense=True)
     return speaks_for(here, there, matcher.config.solver.min_aligned)
 
 
@@ -346,9 +346,14 @@ def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatA
         step, seconds = expected.localCoordinates(place), last.seconds_to(frame.sweep.stamp)
         carried = beyond_any_motion(step, seconds, matcher.config.relocalization)
         drive = matcher.twist_to(place)
-        if np.linalg.norm(drive[3:]) < FASTEST:
+        if _may_drive(drive):
             twists.insert(len(twists) if carried else 0, drive)
     return twists if frame.sweep.duration > 0.0 else twists[:1]
+
+
+def _may_drive(twist: FloatArray) -> bool:
+    """Whether any car is as fast as a (6,) velocity."""
+    return bool(np.linalg.norm(twist[3:]) < FASTEST)
 
 
 def _with_motion(
@@ -365,7 +370,7 @@ def _with_motion(
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
     if told and matcher.motion_is_free:
         fit, near, _ = _tried(frame, matcher, place, solver)
-        if np.linalg.norm(matcher.twist_to(near.map_T_lidar)[3:]) < FASTEST:
+        if _may_drive(matcher.twist_to(near.map_T_lidar)):
             tried.append((fit, near, frame.posed_for(near)))
     for fit, found, posed in tried:
         if not (found.solved and monitor.fits_again(fit)):
@@ -376,8 +381,8 @@ def _with_motion(
         best = _by_own_motion(frame, max(tried, key=lambda one: one[0].total), monitor, solver)
     if best is None:
         return None
-    moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
-    return Found(best[1], best[2], f"moved by {moved}")
+    distance = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
+    return Found(best[1], best[2], f"moved by {distance}")
 
 
 def _tried(

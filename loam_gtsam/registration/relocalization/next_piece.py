@@ -77,8 +77,13 @@ class Gap:
         if turned is not None:
             sigmas[:3] = StartSigmas().gyro_bias * seconds
         sigmas = np.minimum(sigmas, ANYWHERE)
-        to_map = half.AdjointMap() * sigmas
-        return gtsam.Pose3(after, start + way), symmetric(to_map @ to_map.T)
+        return gtsam.Pose3(after, start + way), spread_in_map(half, sigmas)
+
+
+def spread_in_map(pose: gtsam.Pose3, sigmas: FloatArray) -> FloatArray:
+    """Covariance (6, 6) on the left, in map axes, by the deviations (6,) in those of a pose."""
+    to_map = pose.AdjointMap() * sigmas
+    return symmetric(to_map @ to_map.T)
 
 
 def goes_on(mapper: Mapper, features: Features) -> bool:
@@ -174,8 +179,7 @@ class NextPiece:
         if pose.range(self.gap.map_T_lidar) > searched:
             return np.zeros((6, 6))
         sigmas = np.repeat([ANYWHERE[0] if self._turned is None else 0.0, searched], 3)
-        to_map = pose.AdjointMap() * sigmas
-        return symmetric(0.5 * to_map @ to_map.T)
+        return 0.5 * spread_in_map(pose, sigmas)
 
 
 def _another(beside: Mapper, uncertain: FloatArray) -> Mapper:

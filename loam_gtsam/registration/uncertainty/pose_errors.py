@@ -17,7 +17,7 @@ from loam_gtsam.geometry import symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
-from loam_gtsam.registration.relocalization import Gap, same
+from loam_gtsam.registration.relocalization import Gap, same, spread_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
@@ -220,7 +220,8 @@ class PoseErrors:
             if inertial is not None:
                 missed = inertial.covariance_in_map
             elif gap is not None:
-                missed = gap.bridged(now, posed.twist)[1] + _anywhere_near(pose, searched)
+                near = spread_in_map(pose, np.repeat([0.0, searched], 3))
+                missed = gap.bridged(now, posed.twist)[1] + near
                 if expected.inertial is None:
                     steady = gap.steady(now).localCoordinates(pose)
                     step = min(step, steady, key=lambda way: float(np.linalg.norm(way[3:])))
@@ -246,9 +247,3 @@ class PoseErrors:
         """Start anew in time: the next frame is on a clock that was set ahead, nanoseconds."""
         self._own.cut(paused=True)
         self._map.cut(ahead)
-
-
-def _anywhere_near(pose: gtsam.Pose3, metres: float) -> FloatArray:
-    """Covariance (6, 6) on the left, in map axes, of a pose whose position is known to so much."""
-    to_map: FloatArray = pose.AdjointMap()[:, 3:] * metres
-    return to_map @ to_map.T

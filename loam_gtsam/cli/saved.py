@@ -117,8 +117,9 @@ def localise_in_map(options: LocaliseOptions) -> int:
             with console.frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
                 found = localise(
                     dataset, saved, config, max_frames=options.frames, on_frame=on_frame,
-                    workers=worker_count(options.workers, total), extend=options.extend,
-                    inside=options.inside, near=options.position(), **options.parts(config),
+                    keep_partial=True, workers=worker_count(options.workers, total),
+                    extend=options.extend, inside=options.inside, near=options.position(),
+                    **options.parts(config),
                 )  # fmt: skip
             if not found.updates:
                 raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")
@@ -134,9 +135,9 @@ def localise_in_map(options: LocaliseOptions) -> int:
         Console().print(_localised(summary))
         console.print_written(stop, len(found.updates), total, folder, files)
     nothing = f"{dataset.name}: none of the {len(found.updates)} sweeps could be used"
-    code = console.exit_code(None, stop, found.updates, nothing)
     if not found.fixes:
         typer.echo(f"no fix: the data do not fit {path}, or are too short", err=True)
+    code = console.exit_code(found.error, stop, found.updates, nothing)
     return code or int(not found.fixes)
 
 

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.errors import check_count
+from loam_gtsam.errors import PartFaults, SweepFault, check_count, own_code
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
 from loam_gtsam.geometry import as_vector, checked_pose, symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -42,6 +42,7 @@ from loam_gtsam.types import (
     FloatArray,
     FrameStatus,
     InputError,
+    LoamError,
     MapUpdate,
     Scan,
     Sweep,
@@ -154,6 +155,11 @@ class Localizer:
         """Whether the pose is known."""
         return self._hypotheses is None
 
+    @property
+    def faults(self) -> PartFaults:
+        """What is done about exceptions in parts of a user's own."""
+        return self._tracking.faults
+
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Localise one sweep; what it contains never raises, see the status of the result.
 
@@ -168,7 +174,11 @@ class Localizer:
             If a part of a user's own raises and ``parts.on_error`` is ``stop``.
         """
         if isinstance(sweep, Scan) and extraction is None:
-            extraction = extract(sweep, self.config, self._parts.get("features"))
+            try:
+                extraction = extract(sweep, self.config, self._parts.get("features"))
+            except LoamError as error:
+                self.faults.take(error)
+                extraction = Extraction(None, str(error), 0.0, SweepFault.PART_FAILED)
         features = sweep.features if isinstance(sweep, FeatureSweep) else None
         if extraction is not None:
             features = extraction.features
@@ -331,6 +341,7 @@ class Localisation:
     updates : one per sweep
     fixes : number of times that the pose was found by a search in the whole map
     interrupted : stopped (Ctrl-C) before the data set ended
+    error : what ended it before; None if nothing did
     localizer : as it is after the last sweep
     """
 
@@ -339,6 +350,7 @@ class Localisation:
     fixes: int
     interrupted: bool
     localizer: Localizer
+    error: Exception | None = None
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -364,6 +376,7 @@ def localise(
     *,
     max_frames: int | None = None,
     on_frame: OnFrame | None = None,
+    keep_partial: bool = False,
     workers: int = 0,
     extend: bool = False,
     inside: bool = False,
@@ -377,7 +390,7 @@ def localise(
     dataset, saved : see :func:`~loam_gtsam.open_dataset`, :class:`SavedMap`
     config : see :class:`Localizer`
     max_frames : stop after so many sweeps
-    on_frame : e.g. to show progress
+    on_frame, keep_partial : see :func:`~loam_gtsam.run`
     workers : processes that extract the features of the sweeps to come
     extend, inside, near, parts : see :class:`Localizer`
 
@@ -393,14 +406,20 @@ def localise(
     if parts.get("features") is not None:
         workers = 0
     updates: list[MapUpdate] = []
-    interrupted = False
+    interrupted, error = False, None
     source = islice(timed(dataset), max_frames)
     try:
         for sweep, seconds, extraction in extract_ahead(source, localizer.config, workers):
             update = localizer.process(sweep, extraction)
             updates.append(replace(update, timings={"read": seconds} | dict(update.timings)))
-            if on_frame is not None:
-                on_frame(len(updates) - 1, updates[-1])
+            with localizer.faults.forgiven(), own_code("on_frame", on_frame):
+                if on_frame is not None:
+                    on_frame(len(updates) - 1, updates[-1])
     except KeyboardInterrupt:
         interrupted = True
-    return Localisation(localizer.config, updates, localizer.fixes, interrupted, localizer)
+    except Exception as caught:
+        if not (keep_partial and updates):
+            raise
+        error = caught
+    done = localizer.fixes, interrupted, localizer, error
+    return Localisation(localizer.config, updates, *done)

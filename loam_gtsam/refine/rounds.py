@@ -16,6 +16,7 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
+from loam_gtsam.errors import own_code
 from loam_gtsam.geometry import transform
 from loam_gtsam.refine.elimination import (
     Sightings,
@@ -26,6 +27,7 @@ from loam_gtsam.refine.elimination import (
 )
 from loam_gtsam.refine.landmarks import Landmarks, find_landmarks, voxel_sizes
 from loam_gtsam.refine.sweeps import Stack
+from loam_gtsam.registration.solvers.own_factors import check_finite
 from loam_gtsam.types import FloatArray, InputError, IntArray
 
 _GOLDEN: FloatArray = np.array([0.8191725, 0.6710436, 0.5497005])
@@ -217,6 +219,7 @@ class OtherFactors:
         self.known, self._first, self._count = known, first, len(map_T_middle)
         self.ties = [ties.numbers.tolist() for ties in known]
         held: list[int] = []
+        values = self._values(map_T_middle)
         last = first + self._count - 1
         for place in range(self.graph.size()):
             keys: list[int] = self.graph.at(place).keys()
@@ -228,6 +231,8 @@ class OtherFactors:
                     "poses of the sweeps"
                 )
             self.ties.append(numbers)
+            with own_code("factors", f"factor {place}"):
+                check_finite(self.graph.at(place), values, "factors")
             held += numbers if len(numbers) == 1 else []
         self.held = held or [0]
         self._anchor = None if held else gtsam.Pose3(map_T_middle[0])

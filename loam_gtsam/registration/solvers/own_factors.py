@@ -22,6 +22,7 @@ from loam_gtsam.registration.solvers.base import (
 )
 from loam_gtsam.types import FloatArray, InputError
 
+_SUREST = 1e-8  # of a factor; a scan knows 1e-4 to 1e-3, and ten digits are left of that
 LAST_KEY: int = gtsam.symbol("x", 1)
 """Key of the pose of the last sweep, for factors between the last sweep and the current one."""
 
@@ -119,7 +120,7 @@ def own_factors(
                 f"{type(factor).__name__} on the keys {keys}"
             )
         with own_code("extra_factors", extra):
-            _check_finite(factor, near, "extra_factors")
+            check_finite(factor, near, "extra_factors")
             if both:
                 since_last.append(_with_last_held(factor, context, error))
             else:
@@ -134,12 +135,24 @@ def _listed(given: object) -> list[gtsam.NonlinearFactor] | None:
     return list(given) if isinstance(given, Iterable) else None
 
 
-def _check_finite(factor: gtsam.NonlinearFactor, near: gtsam.Values, name: str) -> None:
+def check_finite(factor: gtsam.NonlinearFactor, near: gtsam.Values, name: str) -> None:
+    """InputError, in which the factor is one of ``name``, if it is not finite at ``near``.
+
+    Or so sure that beside it all else is lost in rounding.
+    """
     linear = factor.linearize(near)  # None if the factor does not act there
-    if linear is not None and not np.isfinite(np.column_stack(linear.jacobian())).all():
+    if linear is None:
+        return
+    jacobian, error = linear.jacobian()
+    if not np.isfinite(np.column_stack([jacobian, error])).all():
         raise InputError(
             f"{name}: expected factors that are finite at the predicted pose, got "
             f"{type(factor).__name__} with NaN in its error, Jacobian or noise (sigma 0?)"
+        )
+    if np.abs(jacobian).max(initial=0.0) > 1.0 / _SUREST:
+        raise InputError(
+            f"{name}: expected factors with standard deviations of {_SUREST:g} or more, got "
+            f"{type(factor).__name__} with less; what is that sure needs no estimate"
         )
 
 
@@ -174,7 +187,7 @@ def own_priors(
                 + ("" if keys is None else f" on {keys}")
             )
         with own_code("priors", "given to register"):
-            _check_finite(factor, near, "priors")
+            check_finite(factor, near, "priors")
     try:
         with own_code("priors", "given to register" if factors else None):
             yield factors or ()

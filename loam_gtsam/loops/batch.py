@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.loops.incremental import relative_pose
 from loam_gtsam.loops.keyframes import is_pose, pose_number
-from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch
+from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch, may_be_drift
 from loam_gtsam.types import BoolArray, FloatArray, InputError, check_kind
 
 _INLIER = 0.5  # weight of graduated non-convexity above which a loop closure is in the first choice
@@ -129,14 +129,15 @@ def optimize_graph(
     """
     _check(saved)
     problem = _Problem(saved)
-    active = np.ones(len(problem.loops), np.bool_)
+    possible = problem.possible() if robust else np.ones(len(problem.loops), np.bool_)
+    active = possible
     try:
         graph, poses, distances = problem.solve(active)
-        if robust and (distances > max_chi2).any():
-            active = problem.inliers()
+        if robust and (distances[active] > max_chi2).any():
+            active = problem.inliers() & possible
             graph, poses, distances = problem.solve(active)
             for _ in range(2 * len(active)):
-                number = loop_to_switch(active, distances, max_chi2)
+                number = loop_to_switch(active, np.where(possible, distances, np.inf), max_chi2)
                 if number is None:
                     break
                 active[number] = not active[number]
@@ -211,10 +212,7 @@ class _Problem:
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FloatArray]:
         """Factors that were used, poses, and distance (L,) of each loop closure from the others."""
         graph = self.factors(active)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setVerbosityLM("SILENT")
-        params.setRelativeErrorTol(1e-9)
-        poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, params).optimize()
+        poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, _silent()).optimize()
         if not self.loops:
             return graph, poses, np.empty(0)
         marginals = gtsam.Marginals(graph, poses)
@@ -225,6 +223,26 @@ class _Problem:
             noise = factor.noiseModel().covariance()
             distances.append(chi_squared(factor.measured(), noise, *known, included=on))
         return graph, poses, np.array(distances)
+
+    def possible(self) -> BoolArray:
+        """Which loop closures a drift of the odometry allows; all if only loops tie the poses."""
+        possible = np.ones(len(self.loops), np.bool_)
+        graph, keys = self.factors(~possible), self.saved.keys
+        try:
+            poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, _silent()).optimize()
+            marginals = gtsam.Marginals(graph, poses)
+        except RuntimeError:
+            return possible
+        places = np.array([poses.atPose3(key).translation() for key in keys])
+        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        way = dict(zip(keys, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
+        for number, place in enumerate(self.loops):
+            factor: Any = _without_kernel(self.saved.factors.at(place))
+            first, second = factor.keys()
+            known, noise = relative_pose(poses, marginals, first, second), factor.noiseModel()
+            seen = factor.measured(), noise.covariance()
+            possible[number] = may_be_drift(*seen, *known, abs(way[second] - way[first]))
+        return possible
 
     def inliers(self) -> BoolArray:
         """Which loop closures graduated non-convexity finds right, given all other factors."""
@@ -247,6 +265,13 @@ class _Problem:
         weights = np.asarray(optimizer.getWeights())[list(self.loops)]
         inliers: BoolArray = weights > _INLIER
         return inliers
+
+
+def _silent() -> gtsam.LevenbergMarquardtParams:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setVerbosityLM("SILENT")
+    params.setRelativeErrorTol(1e-9)
+    return params
 
 
 def _without_kernel(factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:

@@ -19,6 +19,10 @@ from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, numbered, odometry
 from loam_gtsam.types import BoolArray, FloatArray
 
 _LIKELY = 12.6  # squared Mahalanobis distance that 95 % of right loop closures do not exceed
+_DRIFT = np.radians(0.02), 0.01
+"""rad and metres a metre of way, by which an odometry may be off beyond its covariance: four to ten
+times what LOAM has on KITTI (Zhang and Singh, Autonomous Robots 41, 2017)."""
+_SIGMAS = 3.0  # of the odometry's own covariance, beside that
 _SWITCHES = 50  # largest number of loop closures that are switched one by one after a new one
 
 
@@ -45,6 +49,28 @@ def chi_squared(
     least = 1e-9 * float(np.trace(noise)) / 6.0
     parts = (vectors.T @ residual) ** 2 / np.maximum(values, least)
     return float(parts[values > least].sum())
+
+
+def may_be_drift(
+    measured: gtsam.Pose3,
+    noise: FloatArray,
+    between: gtsam.Pose3,
+    covariance: FloatArray,
+    way: float,
+) -> bool:
+    """Whether an odometry may have drifted by so much that a measured motion is right.
+
+    A place that looks the same is one storey or one aisle off after any way, drift grows with it.
+
+    Parameters
+    ----------
+    measured, noise, between, covariance : see :func:`chi_squared`, but of the odometry alone
+    way : metres between the two poses
+    """
+    away = gtsam.Pose3.Logmap(measured.between(between)).reshape(2, 3)
+    variances = np.diag(noise + covariance).reshape(2, 3)
+    reach = _SIGMAS * np.sqrt(variances.sum(axis=1)) + way * np.array(_DRIFT)
+    return bool((np.linalg.norm(away, axis=1) <= reach).all())
 
 
 def loop_to_switch(active: BoolArray, distances: FloatArray, max_chi2: float) -> int | None:
@@ -146,12 +172,13 @@ class LoopSelection:
         """Switch from some loop closures to more, a given one among them, which agree.
 
         Either the others were wrong, or the odometry is worse than its covariance says. Only many
-        are believed against it.
+        are believed against it, and only if they may be its drift.
         """
         wrong = sorted(on - most)
         for other in wrong:
             self._graph.switch(other, False)
-        believed = len(most) >= self.config.believed_loops
+        many = len(most) >= self.config.believed_loops
+        believed = many and all(map(self._may_be_drift, most))
         if wrong and not believed:  # without wrong ones it is as it was: too far away
             believed = self.chi_squared(number) <= self.config.max_chi2
         for other in sorted(most - on) if believed else wrong:
@@ -168,6 +195,14 @@ class LoopSelection:
         between, covariance = self._graph.relative(pose_key(loop.earlier), pose_key(loop.later))
         on = self._graph.is_active(number)
         return chi_squared(loop.earlier_T_later, loop.covariance, between, covariance, included=on)
+
+    def _may_be_drift(self, number: int) -> bool:
+        loop = self._loops[number]
+        first, last = (numbered(self._keyframes, index) for index in (loop.earlier, loop.later))
+        if first.session != last.session:  # no odometry, which may be right or wrong
+            return True
+        between, way = odometry_between(first, last, self.config), last.travelled - first.travelled
+        return may_be_drift(loop.earlier_T_later, loop.covariance, *between, way)
 
     def _agreeing(self, number: int) -> set[int]:
         return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}

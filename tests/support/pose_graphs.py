@@ -72,9 +72,9 @@ def wrong_loops(count, size, rng):
     return made
 
 
-def filled(poses, **pose_graph):
+def filled(poses, sigmas=SIGMAS, **pose_graph):
     graph = PoseGraph(settings(**pose_graph))
-    for update in frames(poses):
+    for update in frames(poses, sigmas):
         graph.add(update)
     return graph
 

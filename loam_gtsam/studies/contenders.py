@@ -111,14 +111,14 @@ def with_solver(base: Config, method: str) -> Config:
 def make_contender(group: Group, name: str, base: Config) -> Contender:
     """The contender called ``name`` in a group.
 
+    Raises ConfigError if there is none of that name.
+
     Parameters
     ----------
     group, name : ``SOLVER``: gtsam, loam, aloam, or ``package.module:factory``; ``FEATURES``:
         ``package.module:factory``; ``PRESET``: its name; ``CONFIG``: a file; ``PEER``: its name,
         with settings
     base : into which solvers and front ends are put
-
-    Raises ConfigError if there is none of that name.
     """
     if group is Group.PEER:
         return Contender(name, None, group, peer=name)

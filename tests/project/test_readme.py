@@ -83,6 +83,18 @@ def test_what_the_documentation_imports_is_there_and_public(page: Path) -> None:
             assert hasattr(found, name) or importlib.import_module(f"{module}.{name}")
 
 
+PUBLIC = ("config", "datasets", "factors", "geometry", "pipeline", "studies", "types", "view")
+
+
+@pytest.mark.parametrize("page", [*PAGES, *EXAMPLES], ids=lambda page: page.name)
+def test_what_the_documentation_imports_does_not_change_without_a_word(page: Path) -> None:
+    api = "".join(file.read_text("utf-8") for file in (ROOT / "docs/api").glob("*.md"))
+    listed = set(re.findall(r"^::: loam_gtsam\.(?:\w+\.)*(\w+)$", api, re.M))
+    for module, several, one in IMPORT.findall(page.read_text("utf-8")):
+        if module != "loam_gtsam" and module.split(".")[1] not in PUBLIC:
+            assert set(re.findall(r"\w+", several or one)) <= listed, module
+
+
 WALKED = [page for page in PAGES if any(block.runs for block in walk.blocks(page, *walk.RUN))]
 
 

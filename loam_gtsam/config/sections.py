@@ -410,7 +410,8 @@ class PoseGraphConfig(Section):
     )
     """In iSAM2 a loop closure has a Huber kernel, this wide after whitening; .inf turns it off."""
     believed_loops: int = parameter(6, low=2, high=1000)
-    """At least this many loop closures that agree pairwise are used even against the odometry."""
+    """At least this many loop closures that agree pairwise are used even against the odometry, if
+    it may have drifted so far: by 1 % of the way and 0.02 degrees a metre."""
     visits: int = parameter(4, low=0, high=10_000)
     """This many keyframes that come back to a place stay in the graph; one more, which would lower
     a standard deviation by less than a tenth, is forgotten when the next keyframe comes."""

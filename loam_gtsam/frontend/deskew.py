@@ -7,7 +7,6 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -21,19 +20,6 @@ from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMot
 
 _DISTINCT = 4.5
 """Prominence of a distinct edge in its ring, in standard deviations of range noise."""
-
-
-class TwistError(NamedTuple):
-    """How wrong a body velocity is that the matches of a sweep have told, beside what was expected.
-
-    Attributes
-    ----------
-    kept : (6, 6) share of the error of the expected velocity that is left
-    noise : (6, 6) covariance that came by the matches, (rad/s)^2 and (m/s)^2
-    """
-
-    kept: FloatArray
-    noise: FloatArray
 
 
 class MovingSweep:
@@ -64,7 +50,6 @@ class MovingSweep:
     level_rings : whether beams sweep rings about the lidar's z axis
     motion : source of the rotation within the sweep
     acceleration : (6,) rad/s^2 and m/s^2, of the body velocity; None if that is constant
-    twist_error : of the velocity in the middle; None if matches did not tell it
     not_finite : number of points of the sweep that were NaN or infinite
     """
 
@@ -95,7 +80,6 @@ class MovingSweep:
         self._turned: tuple[FloatArray, FloatArray] | None = None
         self._bend: tuple[FloatArray, FloatArray] | None = None
         self.acceleration: FloatArray | None = None
-        self.twist_error: TwistError | None = None
         self._span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
             if config.deskew.rotation == "orientation":
@@ -151,18 +135,15 @@ class MovingSweep:
         sweep._turned = next(turned), next(turned)
         return sweep
 
-    def accelerated(
-        self, acceleration: FloatArray | None, twist_error: TwistError | None = None
-    ) -> MovingSweep:
+    def accelerated(self, acceleration: FloatArray | None) -> MovingSweep:
         """The sweep of a lidar with a (6,) body acceleration, rad/s^2 and m/s^2, or with none.
 
-        Matches may have told the velocity in its middle, with an error. Nothing changes if a gyro
-        knows the rotation, or without de-skewing.
+        Nothing changes if a gyro knows the rotation, or without de-skewing.
         """
         if self.motion is not SweepMotion.CONSTANT_VELOCITY:
             return self
         sweep = copy(self)
-        sweep.acceleration, sweep.twist_error = acceleration, twist_error
+        sweep.acceleration = acceleration
         return sweep
 
     def later(self, nanoseconds: int) -> MovingSweep:

@@ -12,7 +12,7 @@ import numpy as np
 
 from loam_gtsam.config import Config, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep, TwistError
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.acceleration import Expected
@@ -349,10 +349,9 @@ class FrameMatcher(Matcher):
         solved = twist + 0.5 * interval * usual
         # Middles closer than a sweep is long tell little of the path within it.
         span = max(interval, sweep.duration)
-        error = None
         if matches is not None and self._tells(matches, map_T_lidar):
-            solved, error = self._solved_twist(map_T_lidar, matches, solved, span)
-        return sweep.accelerated(2.0 / span * (solved - twist), error).at(solved)
+            solved = self._solved_twist(map_T_lidar, matches, solved, span)
+        return sweep.accelerated(2.0 / span * (solved - twist)).at(solved)
 
     def twist_to(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6,) mean body velocity that leads to a pose."""
@@ -369,7 +368,7 @@ class FrameMatcher(Matcher):
 
     def _solved_twist(
         self, map_T_lidar: gtsam.Pose3, matches: ScanMatches, expected: FloatArray, span: float
-    ) -> tuple[FloatArray, TwistError]:
+    ) -> FloatArray:
         """(6,) body velocity in the middle of the sweep, by the matches and the expected one.
 
         ``span`` is the seconds in which the velocity changes by twice what it is above the mean.

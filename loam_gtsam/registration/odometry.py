@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import OdometryConfig, SolverConfig
 from loam_gtsam.factors import MatchRows
-from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep, TwistError
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import (
     as_vector,
     checked_pose,
@@ -20,7 +20,6 @@ from loam_gtsam.geometry import (
     nearest_positive,
     parallel_sum,
     squared_norm,
-    symmetric,
 )
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
@@ -282,8 +281,8 @@ def solved_twist(
     range_noise: float,
     *,
     heed_contradiction: bool = False,
-) -> tuple[FloatArray, TwistError]:
-    """(6,) body velocity in the middle of a sweep, by its matches and by the mean one; its error.
+) -> FloatArray:
+    """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
 
     A point measured s seconds from the middle moves with the velocity s times as far as with the
     pose. What a change of the pose explains as well does not count, nor what the noise of the
@@ -323,8 +322,8 @@ def solved_twist(
         if unlikely > five_sigma(len(away)):
             believed = believed * (len(away) / unlikely)
     change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
-    spread = np.linalg.inv(believed + seen)
-    return twist + change, TwistError(spread @ believed, symmetric(spread @ seen @ spread))
+    solved: FloatArray = twist + change
+    return solved
 
 
 def unseen_velocity(seconds: FloatArray, range_noise: float) -> float:

@@ -399,18 +399,18 @@ def sweep_of_walls(twist, assumed, seconds=None, count=3000, scale=50.0):
 def test_the_motion_within_a_sweep_is_found_from_its_matches():
     assumed = TWIST + np.array([0.1, -0.2, 0.1, 1.0, 0.5, -0.5])
     rows, seconds = sweep_of_walls(TWIST, assumed)
-    found, _ = solved_twist(rows, exact(rows), seconds, START, assumed, assumed, WIDE, 0.0)
+    found = solved_twist(rows, exact(rows), seconds, START, assumed, assumed, WIDE, 0.0)
     # One linear step, against an error of a metre per second.
     np.testing.assert_allclose(found, TWIST, atol=0.02)
     rows, seconds = sweep_of_walls(TWIST, found)
-    again, _ = solved_twist(rows, exact(rows), seconds, START, found, assumed, WIDE, 0.0)
+    again = solved_twist(rows, exact(rows), seconds, START, found, assumed, WIDE, 0.0)
     np.testing.assert_allclose(again, TWIST, atol=1e-3)
 
 
 def test_a_mean_velocity_that_is_known_better_stays():
     rows, seconds = sweep_of_walls(TWIST, TWIST, scale=1.0)
     mean = TWIST + 0.05
-    found, _ = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, TIGHT, 0.02)
+    found = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, TIGHT, 0.02)
     np.testing.assert_allclose(found, mean, atol=2e-3)
 
 
@@ -418,7 +418,7 @@ def test_what_the_pose_explains_as_well_is_no_motion():
     """All points of the sweep at one moment: the scan fits at another pose or another velocity."""
     rows, seconds = sweep_of_walls(TWIST, TWIST + 0.2, seconds=0.03)
     mean = TWIST + 0.1
-    found, _ = solved_twist(rows, exact(rows), seconds, START, TWIST + 0.2, mean, np.ones(6), 0.0)
+    found = solved_twist(rows, exact(rows), seconds, START, TWIST + 0.2, mean, np.ones(6), 0.0)
     np.testing.assert_allclose(found, mean, atol=1e-6)
 
 
@@ -433,36 +433,16 @@ def test_what_the_noise_of_the_normals_makes_is_no_information():
     rows = MatchRows(points, normals, offsets, np.full(2000, 30.0))
     mean, missed = np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0]), np.full(6, 0.3)
     still = rows, seconds, gtsam.Pose3(), np.zeros(6), mean, missed, 0.0
-    noisy, _ = solved_twist(still[0], tilts, *still[1:])
+    noisy = solved_twist(still[0], tilts, *still[1:])
     np.testing.assert_allclose(noisy[[2, 3]], [0.3, 5.0], rtol=0.05)
-    believed, _ = solved_twist(still[0], exact(rows), *still[1:])
+    believed = solved_twist(still[0], exact(rows), *still[1:])
     assert believed[2] < 0.1
-
-
-def test_how_wrong_a_solved_motion_is_told():
-    """Many sweeps with noise, each with another error of the mean velocity."""
-    rng = np.random.default_rng(3)
-    missed = np.array([0.02, 0.03, 0.02, 0.2, 0.3, 0.2])
-    rows, seconds = sweep_of_walls(TWIST, TWIST, count=200, scale=10.0)
-    away = []
-    for _ in range(400):
-        mean = TWIST + missed * rng.standard_normal(6)
-        noisy = dataclasses.replace(rows, offsets=rows.offsets + 0.1 * rng.standard_normal(200))
-        given = noisy, exact(noisy), seconds, START, TWIST, mean, missed, 0.0
-        found, (kept, noise) = solved_twist(*given)
-        away.append(found - TWIST)
-    told = kept * missed**2 @ kept.T + noise
-    # Neither the matches nor the mean velocity alone
-    assert (np.diag(told) < 0.95 * missed**2).all()
-    assert (np.diag(noise) > 0.05 * np.diag(told)).all()
-    squared = np.einsum("ni,ij,nj->n", away, np.linalg.inv(told), away)
-    assert np.mean(squared) == pytest.approx(6.0, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [2, 5])
 def test_a_few_matches_leave_the_mean_velocity(count):
     rows, seconds = sweep_of_walls(TWIST, TWIST + 0.2, count=count)
-    found, _ = solved_twist(
+    found = solved_twist(
         rows, exact(rows), seconds, START, TWIST + 0.2, TWIST, np.full(6, 0.1), 0.02
     )
     np.testing.assert_allclose(found, TWIST, atol=1e-6)
@@ -472,9 +452,9 @@ def test_matches_are_believed_up_to_the_error_of_one_side_of_the_sensor():
     """Half of 2 cm over half a sweep: 0.2 m/s, beside a mean velocity that is as uncertain."""
     rows, seconds = sweep_of_walls(TWIST, TWIST, scale=1e4)
     mean, missed = TWIST + 0.1 * np.eye(6)[3], np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2])
-    found, _ = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.02)
+    found = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.02)
     assert found[3] - TWIST[3] == pytest.approx(0.05, rel=0.02)
-    even, _ = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.0)
+    even = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.0)
     assert even[3] - TWIST[3] == pytest.approx(0.0, abs=1e-3)
 
 

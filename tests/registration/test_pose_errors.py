@@ -14,7 +14,7 @@ from support.solved import solved
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.frontend.deskew import PosedSweep, TwistError
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.acceleration import Accelerations
@@ -248,7 +248,7 @@ class _Sweep:
 
     def __init__(self, stamp, motion):
         self.stamp, self.motion, self.middle, self.duration = stamp, motion, 0.05, 0.1
-        self.acceleration = self.twist_error = None
+        self.acceleration = None
 
     def seconds(self, edges, planes):
         return np.zeros(len(edges)), np.zeros(len(planes))
@@ -256,7 +256,7 @@ class _Sweep:
 
 def own_errors(
     acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30, begins=0, known=None,
-    across=0.0, apart=1, turned=None, told=None,
+    across=0.0, apart=1, turned=None,
 ):  # fmt: skip
     """Own error at the start of the last of many sweeps along x, accelerated after some.
 
@@ -277,7 +277,7 @@ def own_errors(
         x = 0.5 * acceleration * (0.1 * apart * max(k - begins, 0)) ** 2
         middle = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
         sweep = _Sweep(apart * k * FRAME, motion)
-        sweep.acceleration, sweep.twist_error = known, told
+        sweep.acceleration = known
         if errors.last is not None:
             accelerations.add(*errors.last, sweep.stamp, middle, covariance)
         update = MapUpdate(sweep.stamp, middle, FrameStatus.OK)
@@ -294,18 +294,6 @@ def test_what_a_constant_velocity_misses():
     noisy = np.diag([0.0, 0.0, 0.0, 1e-2, 1e-2, 1e-2])
     quiet = own_errors(3.0, noisy)
     np.testing.assert_allclose(quiet, 0.5 * noisy, atol=1e-4)
-
-
-def test_a_velocity_that_matches_have_told_is_missed_no_more():
-    """But for what they leave of it, and their own error: 0.03 m/s is 0.6 m/s^2 over 0.1 s."""
-    exact = np.zeros((6, 6))
-    missed = own_errors(3.0, exact)[3, 3]
-    half = TwistError(0.5 * np.eye(6), exact)
-    assert own_errors(3.0, exact, told=half)[3, 3] == pytest.approx(0.25 * missed, rel=1e-6)
-    noisy = TwistError(exact, np.diag([0.0, 0.0, 0.0, 0.03**2, 0.0, 0.0]))
-    own = own_errors(3.0, exact, told=noisy)
-    assert own[3, 3] == pytest.approx((0.6 * 0.1**2 / 6.0) ** 2, rel=1e-6)
-    assert own[4, 4] == 0.0
 
 
 def test_a_velocity_that_is_missed_draws_the_pose_aside():

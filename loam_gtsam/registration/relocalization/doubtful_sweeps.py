@@ -411,7 +411,7 @@ def _by_own_motion(
         rows, seconds = timed_rows(near.matches, sweep, config.solver)
         motions = posed.twist, posed.twist, np.full(6, _ANY)
         pose = near.map_T_lidar
-        twist, _ = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
+        twist = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
         fit, near, posed = _tried(frame, matcher.moving_at(twist), pose, solver)
         if near.solved and monitor.fits_again(fit) and not monitor.unusual(fit):
             return fit, near, posed

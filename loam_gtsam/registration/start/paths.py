@@ -68,7 +68,7 @@ def with_velocity(
     if len(sweeps) > 2:
         expected, _ = _parabola(sweeps, number, map_T_first)
         missed = 0.5 * _usual_change(sweeps)
-        velocity, _ = solved_twist(
+        velocity = solved_twist(
             *matches, one.posed.twist, expected, missed, noise, heed_contradiction=True
         )
         told[number] = replace(one, velocity=velocity)
@@ -77,7 +77,7 @@ def with_velocity(
     mean, now = mean_twist(first, second), second.posed.twist - first.posed.twist
     usual = np.repeat([solver.turn_sigma, solver.acceleration_sigma], 3)
     missed = first.moment.seconds_to(second.moment.stamp) * usual
-    change, _ = solved_twist(*matches, now, np.zeros(6), missed, noise, heed_contradiction=True)
+    change = solved_twist(*matches, now, np.zeros(6), missed, noise, heed_contradiction=True)
     return [
         replace(first, velocity=mean - 0.5 * change),
         replace(second, velocity=mean + 0.5 * change),

@@ -171,16 +171,12 @@ class OwnErrors:
         # is from its chord, between the last two middles, at the reference time.
         variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
         drawn, chord = np.zeros((6, 6)), 0.0
-        kept, by_matches = np.eye(6), np.zeros((6, 6))
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds, faster = unresolved((sweep.stamp - self._last.stamp) * 1e-9, sweep.duration)
             variances = faster**2 * variances
             chord = 0.5 * sweep.middle * (seconds - sweep.middle)
             if scan is not None:
                 drawn = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
-            if sweep.twist_error is not None:  # of a velocity, half of a change between two sweeps
-                kept, by_matches = sweep.twist_error
-                by_matches = (2.0 / seconds) ** 2 * by_matches
         # Along one axis the two might cancel each other, which a stamp that is late does not.
         least = sweep.duration**2 / 24.0
         np.fill_diagonal(drawn, chord + np.maximum(np.diag(drawn), least))
@@ -188,8 +184,7 @@ class OwnErrors:
             variances[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        left = kept * variances @ kept.T + by_matches
-        covariance: FloatArray = drawn @ left @ drawn.T + np.diag(noise)
+        covariance: FloatArray = drawn * variances @ drawn.T + np.diag(noise)
         return covariance
 
 

@@ -206,6 +206,7 @@ def _make_runners(
     common = first or effective_config(Config(), dataset)
     runners: list[PipelineRunner | PeerRunner] = []
     notes: list[str] = []
+    priors: list[str] = []
     features, guess = SharedFeatures(), None
     for entry, config in zip(contenders, configs, strict=True):
         if config is None:
@@ -218,14 +219,15 @@ def _make_runners(
                 )
                 config = config.changed(sensor=common.sensor)
             imu = imu_buffer(dataset, config)
-            if imu is not None and config.imu.prior != common.imu.prior:
-                notes.append(
-                    f"{entry.name}: the tilt of the IMU comes in by imu.prior {config.imu.prior}, "
-                    f"in the first by {common.imu.prior}"
-                )
             # A guess that is shared takes the place of the contender's own odometry.
             parts = cast(Parts, dict(entry.parts) | ({} if guess is None else {"odometry": guess}))
             pipeline = Pipeline(config, imu=imu, **parts)
+            priors.append(pipeline.config.imu.prior)
+            if imu is not None and priors[-1] != priors[0]:
+                notes.append(
+                    f"{entry.name}: the tilt of the IMU comes in by imu.prior {priors[-1]}, "
+                    f"in the first by {priors[0]}"
+                )
             if shared_guess and guess is None:
                 steady = ConstantVelocity(pipeline.mapper.imu)
                 pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)

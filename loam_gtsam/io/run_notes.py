@@ -61,7 +61,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
     if result.range_offset is not None and result.range_offset.problem:
         notes.append(result.range_offset.problem)
-    return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
+    few = result.config.solver.method == "aloam"  # associations, by its design
+    return (*notes, *_on_statuses(result.updates, max(path, _SHORT), few))
 
 
 def _uncovered(result: RunResult, imu: ImuSummary) -> list[str]:
@@ -92,15 +93,15 @@ def _why_vague(updates: Sequence[MapUpdate], largest: float) -> str:
     )
 
 
-def _on_statuses(updates: Sequence[MapUpdate], path: float) -> list[str]:
-    """A sentence on the frames that no scan fixed, or on those that still moved.
+def _on_statuses(updates: Sequence[MapUpdate], path: float, few: bool) -> list[str]:
+    """A sentence on the frames that no scan fixed, or on those that still moved unless ``few``.
 
     Degenerate ones put the run in doubt if they are told to be vague, after so many metres.
     """
     odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
     if not odd:
         moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
-        if moving <= _TOO_MANY * len(updates):
+        if few or moving <= _TOO_MANY * len(updates):
             return []
         share = f"{moving} of {len(updates)} poses still moved"
         return [f"{share} when solver.iterations ended: try more (not_converged)"]

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.quick import QUICK
 
-from loam_gtsam.config import Config, load_config
+from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.tables import read_tum
@@ -286,6 +286,13 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["notes"] == list(doubted.notes)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
+
+
+def test_poses_that_still_move_are_a_note_but_with_a_loam_whose_iterations_are_two(result):
+    moving = tuple(replace(one, status=FrameStatus.NOT_CONVERGED) for one in result.updates)
+    (note,) = replace(result, updates=moving).notes
+    assert "8 of 8 poses still moved" in note
+    assert replace(result, updates=moving, config=preset("aloam")).notes == ()
 
 
 def test_samples_that_come_after_their_sweep_are_a_note(result):

@@ -281,6 +281,13 @@ def walk(way: float, config: PoseGraphConfig) -> FloatArray:
     return np.diag(sigmas**2 * way)
 
 
+def check_covariance(covariance: FloatArray) -> None:
+    """InputError as of :func:`noise_model`, or if a (6, 6) covariance has no variance of a part."""
+    noise_model(covariance)
+    if not (np.diagonal(covariance) > 0.0).all():
+        raise InputError("covariance: expected a positive definite one, got a variance of zero")
+
+
 def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gaussian:
     """A noise model that is never infinitely sure.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copyreg
 import difflib
 import logging
+import os
 import struct
 import tokenize
 import zipfile
@@ -58,6 +59,12 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         wanted = ("gtsam." if kind.__module__.startswith("gtsam.") else "") + kind.__name__
         wanted = f"an {wanted}" if wanted[0] in "AEIOU" else f"a {wanted}"
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
+
+
+def check_path(value: object, name: str) -> None:
+    """InputError for anything but a text or a path."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise InputError(f"{name}: expected a path, got {type(value).__name__}")
 
 
 def check_count(value: object, name: str) -> None:

@@ -429,6 +429,7 @@ def run(
     """
     _check_parts(parts)
     check_count(max_frames, "max_frames")
+    check_count(workers, "workers")
     config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)
     fixes, wheels = aids_of(dataset, config)

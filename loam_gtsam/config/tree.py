@@ -25,7 +25,7 @@ from loam_gtsam.config.base import (
 )
 from loam_gtsam.config.output import BagConfig, LiveConfig
 from loam_gtsam.config.own_parts import PartsConfig
-from loam_gtsam.errors import check_kind, nearest
+from loam_gtsam.errors import check_kind, check_path, nearest
 from loam_gtsam.types import ConfigError, InputError
 
 
@@ -247,6 +247,7 @@ def load_config(path: str | Path) -> Config:
     ConfigError
         If the file cannot be read, is not YAML, or does not fit.
     """
+    check_path(path, "path")
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

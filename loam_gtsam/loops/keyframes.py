@@ -172,6 +172,10 @@ class LoopClosure:
     agreement: float = np.nan
 
     def __post_init__(self) -> None:
+        for index in (self.earlier, self.later):
+            if not isinstance(index, (int, np.integer)):
+                got = type(index).__name__
+                raise InputError(f"loop: expected numbers of keyframes (keyframe.index), got {got}")
         checked_pose(self.earlier_T_later, "earlier_T_later")
 
     def factor(self, kernel_width: float = np.inf) -> gtsam.BetweenFactorPose3:

@@ -19,7 +19,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.errors import check_count
+from loam_gtsam.errors import check_count, check_kind
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
@@ -191,6 +191,9 @@ def compare_solvers(
 
 
 def _check_names(contenders: Sequence[Contender]) -> None:
+    for entry in contenders:
+        how = "make_contender(Group.SOLVER, name, config) makes one"
+        check_kind(entry, Contender, "contenders", how)
     names = [entry.name for entry in contenders]
     if not names or len(set(names)) < len(names):
         raise InputError(

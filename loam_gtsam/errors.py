@@ -5,6 +5,7 @@ from __future__ import annotations
 import copyreg
 import difflib
 import logging
+import os
 import struct
 import tokenize
 import zipfile
@@ -24,6 +25,7 @@ DAMAGED: tuple[type[Exception], ...] = (
     RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What numpy and zipfile raise at a file of arrays that is damaged, or holds something else."""
+_ROUNDED = 1e-6  # seconds by which times of single precision may be off
 _LONGEST = 80  # characters of a name that is looked for among others
 _INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM begins
 
@@ -59,6 +61,12 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
 
 
+def check_path(value: object, name: str) -> None:
+    """InputError for anything but a text or a path."""
+    if not isinstance(value, (str, os.PathLike)):
+        raise InputError(f"{name}: expected a path, got {type(value).__name__}")
+
+
 def check_count(value: object, name: str) -> None:
     """InputError for anything but a whole number, not negative, or None."""
     if value is not None and not (isinstance(value, (int, np.integer)) and value >= 0):
@@ -75,13 +83,25 @@ def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(part).__name__}{lacks}")
 
 
-def are_two_numbers(value: object) -> bool:
-    """Whether it is a pair of numbers that numpy understands."""
+def checked_span(value: object, times: NDArray[Any] | None) -> tuple[float, float]:
+    """The span of a sweep; InputError unless two numbers in order hold most of its finite times."""
     try:
         numbers = np.asarray(value)
     except ValueError:
-        return False
-    return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
+        numbers = np.zeros(0)
+    two = numbers.shape == (2,) and numbers.dtype.kind in "iuf"
+    if not (two and numbers[0] <= numbers[1]):
+        raise InputError(f"Scan.span: expected (first, last) seconds, got {value!r}")
+    first, last = map(float, numbers)
+    if times is not None:
+        finite = np.isfinite(times)
+        inside = (times >= first - _ROUNDED) & (times <= last + _ROUNDED)
+        if 2 * np.count_nonzero(inside) < np.count_nonzero(finite):
+            raise InputError(
+                f"Scan.span: expected the times, {times[finite].min():.6g} to "
+                f"{times[finite].max():.6g} s, within it, got {first:.6g} to {last:.6g} s"
+            )
+    return first, last
 
 
 def check_array(

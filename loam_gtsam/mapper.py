@@ -327,9 +327,17 @@ class Mapper:
 
 
 def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:
-    """The configuration with the settings that a solver brings, by which its results are judged."""
+    """The configuration with the settings that a solver brings, by which its results are judged.
+
+    A classical solver has no graph for the IMU's tilt: the blend does the same to the pose
+    (docs/maths/imu_prior.md).
+    """
     settings = getattr(solver, "config", None)
-    return config.changed(solver=settings) if isinstance(settings, SolverConfig) else config
+    if isinstance(settings, SolverConfig):
+        return config.changed(solver=settings)
+    classical = solver is None and config.solver.method != "gtsam"
+    blended = classical and config.imu.coupling != "off" and config.imu.prior == "equivalent"
+    return config.changed("imu.prior=blend") if blended else config
 
 
 def _check_parts(
@@ -338,12 +346,12 @@ def _check_parts(
     """InputError for a part that is none; ConfigError if a classical solver is to get factors."""
     check_part(solver, "solver", "a solver, as make_solver(config.solver)", "solve")
     check_part(extra, "extra_factors", "a function", "__call__")
-    method, prior = config.solver.method, config.imu.prior
+    method = config.solver.method
     if solver is not None or method == "gtsam":
         return
-    if imu is not None and prior in ("equivalent", "sigma"):
+    if imu is not None and config.imu.prior == "sigma":
         raise ConfigError(
-            f"imu.prior: {prior} is a factor, and solver.method {method} has no graph to put "
+            f"imu.prior: sigma is a factor, and solver.method {method} has no graph to put "
             "it in; use imu.prior blend or off, or solver.method gtsam"
         )
     if extra is not None:

@@ -378,26 +378,21 @@ def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
 def _check_parts(parts: Mapping[str, object]) -> None:
     """TypeError for a keyword that is none, which a TypedDict lets pass; InputError for a part."""
     for name in parts:
+        if name in ("imu", "gnss", "wheels"):
+            raise TypeError(f"{name}: the data set has it, as ArrayDataset(..., {name}=...)")
         if name not in Parts.__annotations__:
-            hint = nearest(name, [*Parts.__annotations__, *signature(run).parameters])
+            hint = nearest(name, [*Parts.__annotations__, *list(signature(run).parameters)[:-1]])
             raise TypeError(f"unexpected keyword argument {name!r}{hint}")
     check_part(parts.get("features"), "features", "a function", "__call__")
-    check_part(parts.get("odometry"), "odometry", "an object", "guess", "remember")
+    check_part(parts.get("odometry"), "odometry", "an object", "guess", "remember", "reset")
     check_part(parts.get("loop_closer"), "loop_closer", "an object", "detect")
 
 
 def run(
-    dataset: Dataset,
-    config: Config | None = None,
-    *,
-    max_frames: int | None = None,
-    on_frame: OnFrame | None = None,
-    keep_partial: bool = False,
-    observe: Observer | None = None,
-    workers: int = 0,
-    checkpoint: Checkpoint | None = None,
-    **parts: Unpack[Parts],
-) -> RunResult:
+    dataset: Dataset, config: Config | None = None, *, max_frames: int | None = None,
+    on_frame: OnFrame | None = None, keep_partial: bool = False, observe: Observer | None = None,
+    workers: int = 0, checkpoint: Checkpoint | None = None, **parts: Unpack[Parts],
+) -> RunResult:  # fmt: skip
     """Map a data set.
 
     Parameters
@@ -432,7 +427,9 @@ def run(
     PartError
         If a part of your own raises, an observer included, and ``parts.on_error`` is ``stop``.
     """
+    _check_parts(parts)
     check_count(max_frames, "max_frames")
+    check_count(workers, "workers")
     config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)
     fixes, wheels = aids_of(dataset, config)

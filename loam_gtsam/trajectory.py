@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
 
+_DIGITS = 1e-2  # that may lack in the matrices of a file
 _ROUNDED = 1e-5  # by which numbers of a rotation may be rounded
 
 
@@ -31,7 +32,7 @@ class Trajectory:
     Raises
     ------
     InputError
-        If there is not one pose for each stamp.
+        If there is not one pose for each stamp, or a matrix without NaN is no pose.
     """
 
     stamps: NDArray[np.int64]
@@ -41,6 +42,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         check_array(self.stamps, "Trajectory.stamps", ("N",), "integer nanoseconds")
         check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")
+        check_poses(self.map_T_lidar, "Trajectory.map_T_lidar")
 
     @classmethod
     def from_poses(
@@ -152,6 +154,20 @@ def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
             "makes one of axes that are rounded"
         )
     return value
+
+
+def check_poses(poses: NDArray[Any], name: str) -> None:
+    """InputError if a matrix of (N, 4, 4) is no pose, as far as it is not NaN; digits may lack."""
+    rotations = poses[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        bad = (off > _DIGITS) | (np.linalg.det(rotations) < 0.0)
+        bad |= (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) > _DIGITS).any(axis=1)
+    if bad.any():
+        raise InputError(
+            f"{name}: expected matrices [R t; 0 0 0 1] with rotations R, got {bad.sum()} others of "
+            f"{len(bad)}, first at {bad.argmax()}; are they transposed?"
+        )
 
 
 def check_increasing(trajectory: Trajectory, caller: str) -> None:

@@ -43,6 +43,8 @@ def features_at(stamp):
         ({"span": (0.1,)}, r"Scan.span: expected \(first, last\) seconds, got \(0.1,\)"),
         ({"span": ("a", "b")}, "Scan.span: expected .* got .'a', 'b'."),
         ({"span": (0.1, (0.2, 0.3))}, "Scan.span: expected"),
+        ({"span": (0.1, 0.0)}, r"Scan.span: expected \(first, last\) seconds, got \(0.1, 0.0\)"),
+        ({"times": np.ones(6), "span": (0.0, 0.1)}, "expected the times, 1 to 1 s, within it"),
     ],
 )
 def test_a_scan_of_wrong_shape_or_dtype_is_refused(fields, message):
@@ -203,3 +205,16 @@ def test_raw_covariance_is_the_inverse_of_the_information_of_a_solved_frame():
     singular = MapUpdate(0, gtsam.Pose3(), FrameStatus.OK)
     assert np.isnan(unsolved.raw_covariance).all()
     assert np.isnan(singular.raw_covariance).all()
+
+
+def test_a_trajectory_of_matrices_that_are_no_poses_is_refused():
+    poses = np.tile(gtsam.Pose3(gtsam.Rot3.Yaw(1.0), [1.0, 2.0, 3.0]).matrix(), (3, 1, 1))
+    unknown = poses.copy()
+    unknown[:, :3, :3] = np.nan  # positions alone
+    unknown[2] = np.nan
+    assert len(Trajectory(np.arange(3), unknown)) == 3
+    mirrored = poses @ np.diag([1.0, 1.0, -1.0, 1.0])
+    for wrong in (poses.transpose(0, 2, 1), 0.0 * poses, 2.0 * poses, mirrored):
+        one = np.stack([poses[0], wrong[0], poses[0]])
+        with pytest.raises(InputError, match="got 1 others of 3, first at 1; are they transposed"):
+            Trajectory(np.arange(3), one)

@@ -63,7 +63,7 @@ def _in_the_run(report: ImuReport, tilt_priors: Mapping[str, int], left_out: int
     dropped = tilt_priors.get("dropped", 0)
     if dropped and report.orientation != "none":
         at = f"{dropped} of {sum(tilt_priors.values())} sweeps"
-        why = "gaps longer than imu.max_gap, or another clock than that of the sweeps"
+        why = "gaps longer than imu.max_gap, another clock, or samples added after their sweep"
         problems.append(f"IMU: no orientation at {at}: {why}")
     if left_out:
         problems.append(

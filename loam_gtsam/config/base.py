@@ -128,6 +128,8 @@ class Section(BaseModel):
         if isinstance(field.default, tuple) and (len(error["loc"]) == 1 or kind == "missing"):
             return (key,), f"expected {len(choices)} values, got {given}"
         expected = _EXPECTED.get(kind, "a valid value").format(**error.get("ctx", {}))
+        if kind == "bool_type" and isinstance(error["input"], str):
+            expected = "true or false (other words, as yes, are text in YAML 1.2)"
         return (key,), f"expected {expected}, got {given}"
 
     @model_validator(mode="after")

@@ -11,6 +11,7 @@ from typing import Any, Self
 from pydantic import model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import DuplicateKeyError
 
 from loam_gtsam.config import sections
 from loam_gtsam.config.aiding import AidingConfig
@@ -25,7 +26,7 @@ from loam_gtsam.config.base import (
 )
 from loam_gtsam.config.output import BagConfig, LiveConfig
 from loam_gtsam.config.own_parts import PartsConfig
-from loam_gtsam.errors import check_kind, nearest
+from loam_gtsam.errors import check_kind, check_path, nearest
 from loam_gtsam.types import ConfigError, InputError
 
 
@@ -218,7 +219,8 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
         Naming the key, its line if known, what was expected and what came.
     """
     if not isinstance(data, Mapping):
-        raise ConfigError(f"{source}: expected a mapping of sections, got {type(data).__name__}")
+        got = "a list" if isinstance(data, (list, tuple)) else type(data).__name__
+        raise ConfigError(f"{source}: expected a mapping of sections, got {got}")
 
     def where(path: tuple[Any, ...]) -> str:
         """``file:line`` of a key if the parser kept it."""
@@ -230,6 +232,11 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
         except (AttributeError, KeyError, TypeError):
             return f"{source}: "
 
+    for key in data:
+        section, dot, name = (key if isinstance(key, str) else "").partition(".")
+        if dot and section in Config.model_fields:
+            problem = f"{key}: expected a section, as {section}: {{{name}: {shown(data[key])}}}"
+            raise ConfigError(f"{where((key,))}{problem}")
     base = preset(data.get("preset", "default"), where(("preset",)))
     return override(base, {k: v for k, v in data.items() if k != "preset"}, where)
 
@@ -247,6 +254,7 @@ def load_config(path: str | Path) -> Config:
     ConfigError
         If the file cannot be read, is not YAML, or does not fit.
     """
+    check_path(path, "path")
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -259,6 +267,9 @@ def parse_config(text: str, source: str = "config") -> Config:
     """As :func:`load_config`, from text."""
     try:
         data = YAML(typ="rt").load(text)
+    except DuplicateKeyError as error:
+        place, problem = error.problem_mark.line + 1, error.problem.partition(" with value")[0]
+        raise ConfigError(f"{source}:{place}: not valid YAML: {problem}, keep one") from error
     # A day 32, an endless number and deep nesting surface as whatever the parser stumbles over.
     except Exception as error:
         raise ConfigError(f"{source}: not valid YAML: {error}") from error

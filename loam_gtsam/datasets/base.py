@@ -17,6 +17,7 @@ import numpy as np
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
+from loam_gtsam.errors import check_count, check_part
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
@@ -110,6 +111,7 @@ class Dataset(Protocol):
 
 def check_dataset(dataset: object) -> None:
     """InputError for anything without the members of a :class:`Dataset` that a run asks for."""
+    check_part(dataset, "dataset", "a Dataset")
     # Of the class first: a property of a bag reads all of its IMU.
     missing = [
         repr(name)
@@ -225,6 +227,8 @@ class PartOf(ChangedDataset):
         begin_s: float | None = None,
         end_s: float | None = None,
     ) -> None:
+        check_count(start, "part: start")
+        check_count(every, "part: every")
         low = 0.0 if begin_s is None else begin_s
         high = np.inf if end_s is None else end_s
         if start < 0 or every < 1 or not 0.0 <= low < high:

@@ -149,13 +149,12 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
     not_finite = 0 if everything else int(np.count_nonzero(~np.isfinite(xyz).all(axis=0)))
     finite = len(keep) - not_finite
     if count < MIN_POINTS:
-        fault = SweepFault.TOO_FEW_POINTS
-        if len(keep) == 0:
-            fault = SweepFault.EMPTY
-        elif finite < MIN_POINTS <= len(keep):
+        fault = SweepFault.TOO_FEW_POINTS if len(keep) else SweepFault.EMPTY
+        if finite < MIN_POINTS <= len(keep):
             fault = SweepFault.NOT_FINITE
-        elif times is not None and np.count_nonzero(np.isfinite(times)) < MIN_POINTS <= finite:
-            fault = SweepFault.BAD_TIMES
+        elif times is not None and (timed := np.isfinite(times).sum()) < MIN_POINTS <= finite:
+            what = f"{timed} of {len(keep)} points have a time that is finite, {MIN_POINTS} have to"
+            raise SweepError(f"{what}; see sensor.times", SweepFault.BAD_TIMES)
         ranges = np.sqrt(squared[np.isfinite(squared)].astype(np.float64))
         median = float(np.median(ranges)) if len(ranges) else 0.0
         far = median > sensor.max_range

@@ -17,7 +17,7 @@ from multiprocessing.heap import Arena
 from multiprocessing.reduction import ForkingPickler
 
 from loam_gtsam.config import Config
-from loam_gtsam.errors import check_kind, own_code
+from loam_gtsam.errors import check_kind, is_own, own_code
 from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.types import Features, Scan, Sweep, SweepError, SweepFault
 
@@ -63,9 +63,12 @@ def extract(scan: Scan, config: Config, front_end: FrontEnd | None = None) -> Ex
         if front_end is None:
             features = extract_features(scan, config)
         else:
-            with own_code("features", front_end):
+            own = front_end if is_own(front_end) else "one of this package"
+            with own_code("features", own):
                 features = front_end(scan)
-                check_kind(features, Features, "what it returns", "extract_features makes them")
+                check_kind(
+                    features, Features, "what features returns", "extract_features makes them"
+                )
         if config.odometry.method == "constant_velocity":
             features = thinned(features, config.map)
     except SweepError as error:

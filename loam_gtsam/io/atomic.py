@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
+from loam_gtsam.errors import check_path
 from loam_gtsam.types import OutputError
 
 _log = logging.getLogger(__name__)
@@ -87,6 +88,7 @@ def _without_nan(value: Any) -> Any:
 
 def make_folder(directory: str | Path) -> Path:
     """Make a folder and check that files can be written there, else raise an OutputError."""
+    check_path(directory, "directory")
     folder = Path(directory)
     try:
         folder.mkdir(parents=True, exist_ok=True)

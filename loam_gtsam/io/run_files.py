@@ -21,6 +21,7 @@ from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import (
     TANGENT,
     FloatArray,
+    InputError,
     IntArray,
     MapUpdate,
     Uncertainty,
@@ -189,6 +190,9 @@ def write_run(
     dataset : what was run, for the records
     extra : further entries of the summary (plain numbers, strings, lists and mappings)
     """
+    if not hasattr(result, "updates"):
+        got = type(result).__name__
+        raise InputError(f"result: expected a RunResult, got {got}; write_run(result, directory)")
     folder = make_folder(directory)
     with suppress(OSError):  # what cannot be removed cannot be replaced, which is told then
         (folder / "summary.json").unlink(missing_ok=True)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loam_gtsam.io.run_files import position_sigmas
-from loam_gtsam.types import FrameStatus, MapUpdate
+from loam_gtsam.types import FrameStatus, MapUpdate, SweepMotion
 
 if TYPE_CHECKING:
+    from loam_gtsam.aiding.imu_summary import ImuSummary
     from loam_gtsam.pipeline import RunResult
 
 DO_NOT_TRUST = "DO NOT TRUST THIS RUN: "
@@ -51,7 +52,7 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         tell = "where it is, loops.enabled or a GNSS receiver may tell"
         notes.append(f"the run goes on{_PIECE} from frame {frames} on: {tell}")
     if result.imu is not None:
-        notes += result.imu.problems
+        notes += [*result.imu.problems, *_uncovered(result, result.imu)]
     if result.fixes is not None and result.fixes.reference is None:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.wheels_problem:
@@ -60,7 +61,23 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
     if result.range_offset is not None and result.range_offset.problem:
         notes.append(result.range_offset.problem)
-    return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
+    few = result.config.solver.method == "aloam"  # associations, by its design
+    return (*notes, *_on_statuses(result.updates, max(path, _SHORT), few))
+
+
+def _uncovered(result: RunResult, imu: ImuSummary) -> list[str]:
+    """A sentence on sweeps that were mapped before their IMU samples came; none if few were."""
+    solved = [update.sweep_motion for update in result.updates if update.status.solved]
+    count = solved.count(SweepMotion.CONSTANT_VELOCITY)
+    asked = result.config.deskew.rotation != "constant_velocity" and not imu.gyro_left_out
+    # Without an orientation either, that is said already.
+    told = imu.report.orientation != "none" and imu.tilt_priors.get("dropped", 0) >= count
+    if not asked or told or count <= _TOO_MANY * len(solved):
+        return []
+    return [
+        f"IMU: its samples did not cover {count} of {len(solved)} sweeps when these were mapped; "
+        "add them before the sweep"
+    ]
 
 
 def _why_vague(updates: Sequence[MapUpdate], largest: float) -> str:
@@ -76,15 +93,15 @@ def _why_vague(updates: Sequence[MapUpdate], largest: float) -> str:
     )
 
 
-def _on_statuses(updates: Sequence[MapUpdate], path: float) -> list[str]:
-    """A sentence on the frames that no scan fixed, or on those that still moved.
+def _on_statuses(updates: Sequence[MapUpdate], path: float, few: bool) -> list[str]:
+    """A sentence on the frames that no scan fixed, or on those that still moved unless ``few``.
 
     Degenerate ones put the run in doubt if they are told to be vague, after so many metres.
     """
     odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
     if not odd:
         moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
-        if moving <= _TOO_MANY * len(updates):
+        if few or moving <= _TOO_MANY * len(updates):
             return []
         share = f"{moving} of {len(updates)} poses still moved"
         return [f"{share} when solver.iterations ended: try more (not_converged)"]

@@ -172,6 +172,10 @@ class LoopClosure:
     agreement: float = np.nan
 
     def __post_init__(self) -> None:
+        for index in (self.earlier, self.later):
+            if not isinstance(index, (int, np.integer)):
+                got = type(index).__name__
+                raise InputError(f"loop: expected numbers of keyframes (keyframe.index), got {got}")
         checked_pose(self.earlier_T_later, "earlier_T_later")
 
     def factor(self, kernel_width: float = np.inf) -> gtsam.BetweenFactorPose3:
@@ -279,6 +283,13 @@ def walk(way: float, config: PoseGraphConfig) -> FloatArray:
     """(6, 6) covariance of what the odometry drifts in metres of way and does not know of."""
     sigmas = np.repeat([np.radians(config.turn_walk_deg), config.walk], 3)
     return np.diag(sigmas**2 * way)
+
+
+def check_covariance(covariance: FloatArray) -> None:
+    """InputError as of :func:`noise_model`, or if a (6, 6) covariance has no variance of a part."""
+    noise_model(covariance)
+    if not (np.diagonal(covariance) > 0.0).all():
+        raise InputError("covariance: expected a positive definite one, got a variance of zero")
 
 
 def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gaussian:

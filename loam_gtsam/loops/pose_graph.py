@@ -24,6 +24,7 @@ from loam_gtsam.loops.keyframes import (
     LoopClosure,
     Tie,
     Visits,
+    check_covariance,
     keyframe_points,
     leads_to_keyframe,
     noise_model,
@@ -161,7 +162,7 @@ class PoseGraph(FactorGraph):
                 f"loop: expected keyframes in their order that are no neighbours, got "
                 f"{loop.earlier} and {loop.later}; if they are swapped, invert the motion"
             )
-        noise_model(loop.covariance)
+        check_covariance(loop.covariance)
         return self._selection.add(loop)
 
     def poses(self) -> FloatArray:

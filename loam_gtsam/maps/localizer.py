@@ -399,7 +399,9 @@ def localise(
     Localisation
         On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
     """
+    check_kind(saved, SavedMap, "saved", "SavedMap(path) opens one")
     check_count(max_frames, "max_frames")
+    check_count(workers, "workers")
     config = effective_config(config or own_settings(saved), dataset)
     imu = imu_buffer(dataset, config)
     localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, near=near, **parts)

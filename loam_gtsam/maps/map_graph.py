@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.aiding.gnss import PlacedFixes
+from loam_gtsam.aiding.placed_fixes import PlacedFixes
 from loam_gtsam.config import Config, LoopConfig
 from loam_gtsam.geometry import nearest_positive, symmetric, transform
 from loam_gtsam.loops.batch import SavedGraph

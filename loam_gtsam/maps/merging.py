@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.aiding.gnss import MAP_KEY, PlacedFixes
+from loam_gtsam.aiding.placed_fixes import MAP_KEY, PlacedFixes
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
 from loam_gtsam.geometry import symmetric, transform_each

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from loam_gtsam.aiding.gnss import MAP_KEY, MEDIAN, PlacedFixes
+from loam_gtsam.aiding.placed_fixes import MAP_KEY, MEDIAN, PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import is_pose_key, pose_key

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -19,7 +20,7 @@ import numpy as np
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
-from loam_gtsam.errors import own_code
+from loam_gtsam.errors import check_kind, own_code
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.pipeline import Observer, Pipeline
@@ -67,12 +68,14 @@ class LiveMapper:
     """Maps sweeps as they come, each as soon as its IMU samples are there.
 
     Any thread may call the ``add`` methods, :meth:`report` and :meth:`wait`, which return at once
-    or when told; one thread at a time calls :meth:`step` or :meth:`work`, which owns the pipeline.
+    or when told; one thread at a time calls :meth:`step`, :meth:`work` or :meth:`finish`, which
+    own the pipeline.
     If nothing is dropped and no sweep waits in vain, poses and map are those of
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
     Memory grows with the map and the keyframes of the loops only, not with the time of the run.
-    Raises ConfigError if features come without one of LOAM's three topics, or ``axes`` is unknown.
+    Raises ConfigError if features come without one of LOAM's three topics, or ``axes`` is unknown,
+    InputError if ``imu`` or ``features`` are something else.
 
     Parameters
     ----------
@@ -91,20 +94,14 @@ class LiveMapper:
     """
 
     def __init__(
-        self,
-        config: Config | None = None,
-        *,
-        imu: bool = False,
-        features: Collection[str] = (),
-        axes: Literal["auto", "lidar", "loam"] = "auto",
-        clouds: CloudStream | None = None,
-        observe: Observer | None = None,
-        solver: ScanSolver | None = None,
-        odometry: Odometry | None = None,
-        extra_factors: ExtraFactors | None = None,
-        loop_closer: LoopCloser | None = None,
+        self, config: Config | None = None, *, imu: bool = False,
+        features: Collection[str] = (), axes: Literal["auto", "lidar", "loam"] = "auto",
+        clouds: CloudStream | None = None, observe: Observer | None = None,
+        solver: ScanSolver | None = None, odometry: Odometry | None = None,
+        extra_factors: ExtraFactors | None = None, loop_closer: LoopCloser | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+    ) -> None:  # fmt: skip
+        check_kind(imu, bool, "imu", "whether add_imu will be called")
         self._config = config = as_config(config)
         self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
         bounded = config.live.when_full != "never"
@@ -215,12 +212,20 @@ class LiveMapper:
             if self._imu is not None:
                 self._log.dropped["imu"] = self._imu.dropped
                 self._log.late["imu"] = self._imu.late
-            return self._log.report(len(self._queue), self._matcher.unmatched)
+            waiting = len(self._queue) + (self._current is not None)
+            return self._log.report(waiting, self._matcher.unmatched)
 
     # -- from the one thread that maps -------------------------------------------------------------
 
     def step(self) -> LiveResult | None:
         """Map the next sweep; None if there is none or the next one waits for the IMU."""
+        return self._step(ended=False)
+
+    def finish(self) -> list[LiveResult]:
+        """Map all sweeps that wait, without waiting for the IMU: to be called at the end."""
+        return list(iter(partial(self._step, ended=True), None))
+
+    def _step(self, *, ended: bool) -> LiveResult | None:
         self._news.clear()
         while self._current is None:
             with self._lock:
@@ -231,7 +236,7 @@ class LiveMapper:
                 self._current = self._decoder.decode(received, content)
             except DatasetError as error:
                 self.fault(str(error))
-        if self._must_wait(self._current):
+        if self._must_wait(self._current, ended):
             return None
         current, self._current = self._current, None
         return self._map(current)
@@ -274,7 +279,7 @@ class LiveMapper:
         self._log.deepest = max(self._log.deepest, len(queue))
         self._news.set()
 
-    def _must_wait(self, current: ReadySweep) -> bool:
+    def _must_wait(self, current: ReadySweep, ended: bool) -> bool:
         imu, config, aid = self._imu, self._config, self.pipeline.mapper.imu
         if imu is None or aid is None or current.needs is None:
             return False
@@ -284,7 +289,7 @@ class LiveMapper:
         if imu.covers(current.needs + more):
             return False
         patience = round(config.live.imu_wait * 1e9) + more
-        if self._clock() < current.received + patience:
+        if not ended and self._clock() < current.received + patience:
             return True
         self._no_level = levelling or self._no_level
         if not imu.covers(current.needs):

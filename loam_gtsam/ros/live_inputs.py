@@ -32,6 +32,7 @@ from loam_gtsam.types import (
     LoamError,
     Scan,
     Sweep,
+    check_kind,
 )
 
 _AFTER_STAMP = {"auto": 1.0, "start": 1.0, "middle": 0.5, "end": 0.0}
@@ -61,6 +62,7 @@ class SweepDecoder:
         axes: Literal["auto", "lidar", "loam"],
         clouds: CloudStream,
     ) -> None:
+        check_kind(features, Collection, "features", "they are the topics of LOAM's front end")
         missing = [topic for topic in REQUIRED if topic not in features]
         if features and missing:
             raise ConfigError(f"features: expected {', '.join(missing)} among them")

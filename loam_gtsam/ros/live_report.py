@@ -40,7 +40,7 @@ class LiveReport:
         a time that has been mapped
     without_imu : sweeps mapped although their IMU samples had not all come
     statuses : sweeps mapped, by status
-    waiting, deepest : sweeps in the queue now, and at most
+    waiting, deepest : sweeps not yet mapped, and in the queue at most
     latency : of the last 1000 sweeps, by stage: ``waiting`` from its reception to the start,
         ``mapping``, ``publishing``, and ``total``. Empty before the first one.
     """

@@ -122,11 +122,14 @@ class LiveNode:
     def stop(self) -> None:
         """End the thread between two sweeps, and write the run if there is a folder for it.
 
+        What still waits is mapped for the run that is written, and not published.
         The error that ended the thread earlier, if any, is raised again.
         """
         self._stop.set()
         self._thread.join()
         with self._held:
+            if self._output is not None and self._error is None:
+                self.live.finish()
             if self._output is not None and self._updates:
                 result = self.live.pipeline.result(self._updates, error=self._error)
                 write_run(result, self._output, dataset="live")
@@ -199,6 +202,8 @@ class LiveNode:
             self._publish(self._messages.in_map(self._in_map.add(sweep, update)))
 
     def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
+        if self._stop.is_set():  # ROS may have been shut down
+            return
         try:
             for topic, message in messages:
                 # RTPS pads to words of four bytes, which not every middleware does for bytes.

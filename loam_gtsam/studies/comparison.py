@@ -19,7 +19,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.errors import check_count
+from loam_gtsam.errors import check_count, check_kind
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
@@ -191,6 +191,9 @@ def compare_solvers(
 
 
 def _check_names(contenders: Sequence[Contender]) -> None:
+    for entry in contenders:
+        how = "make_contender(Group.SOLVER, name, config) makes one"
+        check_kind(entry, Contender, "contenders", how)
     names = [entry.name for entry in contenders]
     if not names or len(set(names)) < len(names):
         raise InputError(
@@ -206,6 +209,7 @@ def _make_runners(
     common = first or effective_config(Config(), dataset)
     runners: list[PipelineRunner | PeerRunner] = []
     notes: list[str] = []
+    priors: list[str] = []
     features, guess = SharedFeatures(), None
     for entry, config in zip(contenders, configs, strict=True):
         if config is None:
@@ -218,14 +222,15 @@ def _make_runners(
                 )
                 config = config.changed(sensor=common.sensor)
             imu = imu_buffer(dataset, config)
-            if imu is not None and config.imu.prior != common.imu.prior:
-                notes.append(
-                    f"{entry.name}: the tilt of the IMU comes in by imu.prior {config.imu.prior}, "
-                    f"in the first by {common.imu.prior}"
-                )
             # A guess that is shared takes the place of the contender's own odometry.
             parts = cast(Parts, dict(entry.parts) | ({} if guess is None else {"odometry": guess}))
             pipeline = Pipeline(config, imu=imu, **parts)
+            priors.append(pipeline.config.imu.prior)
+            if imu is not None and priors[-1] != priors[0]:
+                notes.append(
+                    f"{entry.name}: the tilt of the IMU comes in by imu.prior {priors[-1]}, "
+                    f"in the first by {priors[0]}"
+                )
             if shared_guess and guess is None:
                 steady = ConstantVelocity(pipeline.mapper.imu)
                 pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)

@@ -97,15 +97,8 @@ class Contender:
 
 
 def with_solver(base: Config, method: str) -> Config:
-    """``base`` with another ``solver.method`` and nothing else.
-
-    One thing must follow: the IMU's tilt is a factor only where there is a graph. The classical
-    solvers get the blend, which does the same to the pose (``docs/maths/imu_prior.md``).
-    """
-    changes: dict[str, Any] = {"solver.method": method}
-    if method != "gtsam" and base.imu.prior in ("equivalent", "sigma"):
-        changes["imu.prior"] = "blend"
-    return base.changed(changes)
+    """``base`` with another ``solver.method`` and nothing else."""
+    return base.changed({"solver.method": method})
 
 
 def make_contender(group: Group, name: str, base: Config) -> Contender:

@@ -278,6 +278,8 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
         If no update lies inside the reference, its stamps do not increase, or it has positions
         alone.
     """
+    check_kind(updates, Sequence, "nees: updates", "result.updates of a run are such")
+    check_kind(reference, Trajectory, "nees: reference", "the truth of a data set is one")
     check_increasing(reference, "nees")
     first, last = reference.stamps[0], reference.stamps[-1]
     inside = [n for n, u in enumerate(updates) if u.status.has_pose and first <= u.stamp <= last]

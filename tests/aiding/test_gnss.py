@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
 
-from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, fix_factor, tie, write_enu
+from loam_gtsam.aiding.gnss import tie, write_enu
+from loam_gtsam.aiding.placed_fixes import ANTENNA_KEY, MAP_KEY, fix_factor
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.io.trajectories import write_tum

@@ -87,7 +87,10 @@ def test_orientations_of_another_length_cost_no_others(bad: int) -> None:
     assert len(samples.stamps) == 5
     if bad > 2:
         assert samples.orientation is None
-        assert problems == ["IMU: no orientation in it (not given, or not of unit length)"]
+        assert problems == ["IMU: no orientation in it (not of unit length)"]
+        values[:, :4] = 0.0  # not given, which is no fault
+        assert clean_imu(np.arange(5), values, given := []).orientation is None
+        assert given == []
         return
     assert np.isnan(samples.orientation[:bad]).all()
     np.testing.assert_array_equal(samples.orientation[bad:], imu_values(5 - bad)[:, :4])

@@ -13,7 +13,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
 from loam_gtsam.frontend.rings import ELEVATIONS, are_level, rings_from_file_order
-from loam_gtsam.types import Scan, SweepError
+from loam_gtsam.types import Scan, SweepError, SweepFault
 
 VLP16 = ELEVATIONS["vlp16"]
 COLUMNS = 360
@@ -416,6 +416,14 @@ def test_a_few_nonsense_times_are_dropped_but_wrong_units_are_refused() -> None:
     assert sweep.span[1] < 0.1
     with pytest.raises(SweepError, match=r"point times span .* s in one sweep.*not in seconds"):
         organise(Scan(points, 0, rings=rings, times=1e9 * fraction), Config())
+
+
+def test_a_sweep_whose_times_are_nan_is_told_so() -> None:
+    points, rings, fraction = firing(VLP16)
+    nowhen = Scan(points, 0, rings=rings, times=np.nan * fraction)
+    with pytest.raises(SweepError, match=r"0 of .* points have a time that is finite") as caught:
+        organise(nowhen, Config())
+    assert caught.value.fault is SweepFault.BAD_TIMES
 
 
 @pytest.mark.parametrize(("times", "power"), [("field", 1), ("field", 6), ("none", 1)])

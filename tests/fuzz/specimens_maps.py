@@ -14,7 +14,7 @@ import laspy
 import numpy as np
 
 from loam_gtsam import Config, run
-from loam_gtsam.aiding.gnss import PlacedFixes
+from loam_gtsam.aiding.placed_fixes import PlacedFixes
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.io.read_run import read_updates

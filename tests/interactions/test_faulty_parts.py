@@ -179,6 +179,9 @@ def test_a_prior_that_fails_is_named_and_the_sweep_can_be_tried_again():
     for pose, noise in ((nowhere, NOISE), (gtsam.Pose3(), exact)):
         with pytest.raises(InputError, match=r"priors: .* PriorFactorPose3 with NaN .*sigma 0"):
             mapper.register(features[2], priors=[gtsam.PriorFactorPose3(POSE_KEY, pose, noise)])
+    fixed = gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), gtsam.noiseModel.Constrained.All(6))
+    with pytest.raises(InputError, match=r"priors: expected no constraint, .* use a small sigma"):
+        mapper.register(features[2], priors=[fixed])
     undisturbed = mapper.register(features[2], priors=(factor for factor in priors))
     np.testing.assert_array_equal(undisturbed.map_T_lidar.matrix(), found[0])
     np.testing.assert_array_equal(np.sort(mapper.map_points()[1], axis=0), found[1])
@@ -229,7 +232,9 @@ def test_a_part_that_returns_something_else_is_named(part, returned, said, caplo
         "features": lambda scan: returned,
         "loop_closer": SimpleNamespace(detect=lambda *_: returned, reset=own.reset),
         "solver": SimpleNamespace(solve=lambda *_: returned),
-        "odometry": SimpleNamespace(guess=lambda *_: returned, remember=own.remember),
+        "odometry": SimpleNamespace(
+            guess=lambda *_: returned, remember=own.remember, reset=own.reset
+        ),
     }
     with pytest.raises(InputError, match=said) as caught:
         run(DATA, QUICK, **{part: parts[part]})
@@ -239,12 +244,23 @@ def test_a_part_that_returns_something_else_is_named(part, returned, said, caplo
     assert said in caplog.text
 
 
+class WithoutReset:
+    def guess(self, features, last):
+        raise NotImplementedError
+
+    def remember(self, features):
+        raise NotImplementedError
+
+
 @pytest.mark.parametrize(
     ("keywords", "error", "said"),
     [
         ({"extra_factor": None}, TypeError, "'extra_factor'; did you mean 'extra_factors'?"),
         ({"max_frame": 2}, TypeError, "'max_frame'; did you mean 'max_frames'?"),
         ({"loop_closer": ScanLoopCloser}, InputError, "expected an object, got the class"),
+        ({"imu": None}, TypeError, r"imu: the data set has it, as ArrayDataset\(\.\.\., imu="),
+        ({"wheels": None}, TypeError, "wheels: the data set has it"),
+        ({"odometry": WithoutReset()}, InputError, "got WithoutReset without reset"),
     ],
 )
 def test_a_keyword_that_is_none_and_a_class_for_an_object_are_refused(keywords, error, said):

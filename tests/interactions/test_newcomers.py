@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -27,9 +28,16 @@ from loam_gtsam import (
     run,
     write_graph,
 )
+from loam_gtsam.config import load_config
+from loam_gtsam.io.checkpoint import Checkpoint
+from loam_gtsam.io.run_files import write_run
 from loam_gtsam.io.trajectories import write_kitti, write_tum
-from loam_gtsam.maps import save_map
-from loam_gtsam.types import DatasetError
+from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.maps import localise, save_map
+from loam_gtsam.registration.uncertainty.pose_errors import relative_covariance
+from loam_gtsam.studies.comparison import compare_solvers
+from loam_gtsam.studies.evaluation import nees
+from loam_gtsam.types import DatasetError, PartError
 
 WORLD = SimulatedWorld("room", frames=2, columns=400)
 SWEEP = WORLD[0]
@@ -52,6 +60,20 @@ MISTAKES: list[tuple[Callable[[], object], str]] = [
     (lambda: Pipeline(features=5), "features: expected a function, got int"),
     (lambda: Pipeline(odometry=5), "odometry: .* got int without guess and remember"),
     (lambda: Pipeline(loop_closer=5), "loop_closer: expected an object, got int without detect"),
+    (lambda: run(SimulatedWorld), "dataset: expected a Dataset, got the class SimulatedWorld"),
+    (lambda: run(WORLD, workers=-1), "workers: expected a whole number, 0 or more"),
+    (lambda: run(WORLD, workers=2.5), "workers: expected a whole number, 0 or more"),
+    (lambda: WORLD.part(0.5), "start: expected a whole number"),
+    (lambda: localise(WORLD, "m.lgmap"), r"saved: .* got str; SavedMap\(path\) opens one"),
+    (lambda: LoopClosure(None, None, gtsam.Pose3(), np.eye(6)), r"numbers of .* got NoneType"),
+    (lambda: relative_covariance(X, X), "earlier: expected a MapUpdate, got ndarray"),
+    (lambda: nees(None, WORLD.truth), r"updates: .* got NoneType; result\.updates of a run"),
+    (lambda: compare_solvers(WORLD, ["gtsam"]), "contenders: expected a Contender, got str; make"),
+    (lambda: open_dataset(None), "path: expected a path, got NoneType"),
+    (lambda: load_config(None), "path: expected a path, got NoneType"),
+    (lambda: Checkpoint(None), "folder: expected a path, got NoneType"),
+    (lambda: write_run("out", WORLD), "result: expected a RunResult, got str; write_run"),
+    (lambda: write_run(SimpleNamespace(updates=()), None), "directory: expected a path, got None"),
     (lambda: run(WORLD, checkpoint="kept"), r"checkpoint: .* Checkpoint\(folder\) makes one"),
     (lambda: extract_features(SWEEP, "loam"), "expected a Config, got str 'loam'"),
     (lambda: extract_features(SWEEP.points, Config()), "scan: expected a Scan, got ndarray"),
@@ -104,3 +126,8 @@ def test_files_of_junk(tmp_path: Path, name: str, answer: str) -> None:
     (tmp_path / name).write_bytes(bytes(range(128, 256)) * 20)
     with pytest.raises(DatasetError, match=answer):
         open_dataset(tmp_path / name)
+
+
+def test_a_front_end_that_is_called_otherwise_is_a_part_error():
+    with pytest.raises(PartError, match=r"features of your own .* raised TypeError: extract_feat"):
+        run(WORLD, features=extract_features)

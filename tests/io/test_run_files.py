@@ -13,15 +13,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.quick import QUICK
 
-from loam_gtsam.config import Config, load_config
+from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io import run_files
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.trajectories import write_kitti, write_tum
-from loam_gtsam.pipeline import RunResult, run
+from loam_gtsam.pipeline import Pipeline, RunResult, run
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     DatasetError,
@@ -29,6 +30,7 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     OutputError,
+    SweepMotion,
     Trajectory,
 )
 
@@ -284,6 +286,31 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["notes"] == list(doubted.notes)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
+
+
+def test_poses_that_still_move_are_a_note_but_with_a_loam_whose_iterations_are_two(result):
+    moving = tuple(replace(one, status=FrameStatus.NOT_CONVERGED) for one in result.updates)
+    (note,) = replace(result, updates=moving).notes
+    assert "8 of 8 poses still moved" in note
+    assert replace(result, updates=moving, config=preset("aloam")).notes == ()
+
+
+def test_samples_that_come_after_their_sweep_are_a_note(result):
+    def noted(result):
+        return [note for note in result.notes if "did not cover" in note]
+
+    alone = [
+        replace(update, sweep_motion=SweepMotion.CONSTANT_VELOCITY) for update in result.updates
+    ]
+    late = replace(result, updates=tuple(alone))
+    (note,) = noted(late)
+    assert note.startswith("IMU: its samples did not cover 7 of 7 sweeps when these were mapped")
+    assert not noted(replace(late, config=Config().changed("deskew.rotation=constant_velocity")))
+    assert not noted(replace(late, imu=replace(result.imu, gyro_left_out=2)))
+    assert not noted(replace(late, imu=None))
+    pipeline = Pipeline(QUICK, imu=ImuBuffer(QUICK.imu))
+    (note,) = noted(pipeline.result([pipeline.process(WORLD[i]) for i in range(2)]))
+    assert "1 of 1" in note
 
 
 @pytest.mark.parametrize(

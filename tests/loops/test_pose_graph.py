@@ -232,7 +232,7 @@ def test_bad_loops_are_refused():
     for earlier, later in ((0, 16), (-1, 9), (0, 0), (9, 0), (0, 1)):
         with pytest.raises(InputError, match="keyframe"):
             graph.add_loop(replace(good, earlier=earlier, later=later))
-    for covariance in (np.eye(5), nan, -np.eye(6), lopsided):
+    for covariance in (np.eye(5), nan, -np.eye(6), lopsided, np.zeros((6, 6))):
         with pytest.raises(InputError, match="covariance: expected"):
             graph.add_loop(replace(good, covariance=covariance))
     assert graph.loops == []

@@ -442,7 +442,7 @@ def test_the_classical_systems_track_too_from_a_fix_of_the_default_solver(mapped
 
 
 def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):
-    config = preset("loam").changed("imu.prior=equivalent")
+    config = preset("loam").changed("imu.prior=sigma")
     with pytest.raises(ConfigError, match=r"imu\.prior"):
         localise(mapped.world, saved, config)
 

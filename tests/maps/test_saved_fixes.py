@@ -12,7 +12,7 @@ import pytest
 from support.cli import loam
 from support.receiver import SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
 
-from loam_gtsam.aiding.gnss import PlacedFixes
+from loam_gtsam.aiding.placed_fixes import PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.datasets.truth import read_truth

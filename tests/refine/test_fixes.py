@@ -10,7 +10,7 @@ import pytest
 from support.receiver import ORIGIN, SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
 from support.ties import check_gradient
 
-from loam_gtsam.aiding.gnss import PlacedFixes
+from loam_gtsam.aiding.placed_fixes import PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.maps.map_file import SavedMap, save_map

@@ -48,6 +48,7 @@ from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.bags.bag_reader import Message
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, RunResult, effective_config, imu_buffer, run
 from loam_gtsam.registration.odometry import make_odometry
@@ -412,6 +413,19 @@ def test_a_sweep_waits_for_its_samples_and_no_longer(bag: Path) -> None:
     assert late == sum(m.received - 3 * MS <= sweeps[1].received - 20 * MS for m in samples)
 
 
+def test_what_waits_in_the_end_counts_and_is_mapped(bag: Path) -> None:
+    messages = messages_of(bag)
+    sweeps = [m for m in messages if m.topic == POINTS][:2]
+    live = LiveMapper(QUICK, imu=True, clock=Clock())
+    for message in sweeps:
+        hand_over(live, message)
+    assert live.step() is None
+    assert live.report().waiting == 2
+    assert [result.update.status for result in live.finish()] == ["first", "ok"]
+    assert (live.report().waiting, live.report().without_imu) == (0, 2)
+    assert live.finish() == []
+
+
 def test_sweeps_wait_for_samples_by_the_clock_that_is_put_right() -> None:
     imu = LiveImu(ImuConfig(time_offset=-0.05), None)
     imu.add((1000 * MS, np.zeros(10)))
@@ -736,6 +750,14 @@ def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
 )
 def test_options_that_contradict_each_other_are_errors(options: Any, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
+        LiveMapper(**options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"imu": ImuConfig()}, {"features": extract_features}], ids=["imu", "features"]
+)
+def test_options_of_a_wrong_kind_are_named(options: Any) -> None:
+    with pytest.raises(InputError, match=f"{next(iter(options))}: expected a "):
         LiveMapper(**options)
 
 

@@ -219,6 +219,18 @@ def test_the_files_of_the_run_are_written_when_the_node_ends(
     np.testing.assert_allclose(written.map_T_lidar, offline.trajectory.map_T_lidar, atol=1e-8)
 
 
+def test_what_waits_when_the_node_ends_is_in_the_files_and_not_published(
+    bag: Path, quick: str, tmp_path: Path
+) -> None:
+    node = FakeNode(imu_topic=IMU, output=str(tmp_path / "run"), config=quick)
+    live = LiveNode(node)
+    node.callbacks[POINTS](dict(raw_messages(bag))[POINTS])
+    live.start()
+    live.stop()
+    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == 1
+    assert node.published == []
+
+
 def test_frames_by_rep_105(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 0.5]))
     monkeypatch.setattr(LoopMapping, "map_T_odom", moved)

@@ -170,7 +170,8 @@ def _read_rows(
         numbers = [float(cell) for cell in cells[2 if names[0] == "secs" else 1 :]]
         return _stamp(names[0], cells), convert(numbers)
 
-    found = convert_lines(path, split, f"{len(names)} numbers ({columns})")
+    unit = "; t in seconds" if names[0] == "t" else ""
+    found = convert_lines(path, split, f"{len(names)} numbers ({columns}{unit})")
     rows = [row for row in found if row is not None]
     return np.array([stamp for stamp, _ in rows], np.int64), [row for _, row in rows]
 
@@ -232,9 +233,9 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     bad = np.abs(norms[:, 0] - 1.0) > UNIT_TOLERANCE
     orientation[bad] = np.nan
     unknown = bool(2 * bad.sum() > len(bad))
-    if unknown:
-        problems.append("IMU: no orientation in it (not given, or not of unit length)")
-    elif bad.any():
+    if unknown and norms.any():
+        problems.append("IMU: no orientation in it (not of unit length)")
+    elif not unknown and bad.any():
         problems.append(
             f"IMU: {bad.sum()} of {len(bad)} orientations are not of unit length, left out"
         )

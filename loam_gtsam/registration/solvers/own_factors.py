@@ -116,8 +116,8 @@ def own_factors(
         if keys != [context.key] and not both:
             raise InputError(
                 "extra_factors: expected GTSAM factors on context.key, or on context.key and "
-                f"context.last_key ({context.key} and {context.last_key}); got "
-                f"{type(factor).__name__} on the keys {keys}"
+                f"context.last_key ({_names([context.key, context.last_key])}); got "
+                f"{type(factor).__name__} on the keys {_names(keys)}"
             )
         with own_code("extra_factors", extra):
             check_finite(factor, near, "extra_factors")
@@ -135,14 +135,23 @@ def _listed(given: object) -> list[gtsam.NonlinearFactor] | None:
     return list(given) if isinstance(given, Iterable) else None
 
 
+def _names(keys: Iterable[int]) -> str:
+    return f"[{', '.join(map(gtsam.DefaultKeyFormatter, keys))}]"
+
+
 def check_finite(factor: gtsam.NonlinearFactor, near: gtsam.Values, name: str) -> None:
     """InputError, in which the factor is one of ``name``, if it is not finite at ``near``.
 
-    Or so sure that beside it all else is lost in rounding.
+    Or a constraint, or so sure that beside it all else is lost in rounding.
     """
     linear = factor.linearize(near)  # None if the factor does not act there
     if linear is None:
         return
+    if isinstance(linear, gtsam.JacobianFactor) and linear.isConstrained():
+        raise InputError(
+            f"{name}: expected no constraint, got {type(factor).__name__} with a constrained noise "
+            "model (sigma 0?); use a small sigma"
+        )
     jacobian, error = linear.jacobian()
     if not np.isfinite(np.column_stack([jacobian, error])).all():
         raise InputError(
@@ -184,7 +193,7 @@ def own_priors(
             raise InputError(
                 "priors: expected a list of GTSAM factors on POSE_KEY of "
                 f"loam_gtsam.registration.solvers alone, got {type(factor).__name__}"
-                + ("" if keys is None else f" on {keys}")
+                + ("" if keys is None else f" on {_names(keys)}")
             )
         with own_code("priors", "given to register"):
             check_finite(factor, near, "priors")

@@ -25,7 +25,14 @@ from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 from loam_gtsam.registration.uncertainty.map_error import MapError
 from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
-from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, Uncertainty
+from loam_gtsam.types import (
+    FloatArray,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    Uncertainty,
+    check_kind,
+)
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
@@ -43,8 +50,9 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     InputError
         If a frame was not solved, or ``later`` is not later than ``earlier``.
     """
-    begins = earlier.status is FrameStatus.FIRST
+    begins = getattr(earlier, "status", None) is FrameStatus.FIRST
     for name, update in (("earlier", earlier), ("later", later)):
+        check_kind(update, MapUpdate, name, "the updates of a run are such")
         if update.uncertainty is None and not (begins and update is earlier):
             raise InputError(
                 f"{name}: expected a frame that was solved, got one with status {update.status}; "

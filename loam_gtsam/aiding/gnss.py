@@ -7,7 +7,7 @@ and the antenna in the frame of the lidar. Equations: docs/gnss.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from loam_gtsam.aiding.alignment import align
 from loam_gtsam.aiding.fix_selection import FEWEST, LEAST, FixSelection
-from loam_gtsam.aiding.placed_fixes import ANTENNA_KEY, MAP_KEY, PlacedFixes
+from loam_gtsam.aiding.placed_fixes import ANTENNA_KEY, LARGEST, MAP_KEY, MEDIAN, PlacedFixes
 from loam_gtsam.aiding.placed_fixes import fix_factor as fix_factor
 from loam_gtsam.config import AidingConfig
 from loam_gtsam.datasets.decode.aiding import GnssFixes
@@ -51,6 +51,8 @@ class TiedFixes:
     scale : by which the receiver's standard deviations are too small, at least 1
     antenna : (3,) metres, as estimated, in the frame of the lidar
     placed : the fixes that were used, by numbers of keyframes
+    antenna_off : by how many of its standard deviations the antenna is not where it was said to be;
+        0 if that is chance. It then counts as less certain
     """
 
     reference: GeoReference | None
@@ -61,6 +63,7 @@ class TiedFixes:
     scale: float = 1.0
     antenna: FloatArray | None = None
     placed: PlacedFixes | None = None
+    antenna_off: float = 0.0
 
     def __str__(self) -> str:
         """A line."""
@@ -82,6 +85,7 @@ class TiedFixes:
             "rejected_stamps_ns": self.stamps[~self.used].tolist(),
             "sigma_scale": self.scale,
             "lidar_t_antenna": None if antenna is None else antenna.tolist(),
+            "antenna_off_sigmas": self.antenna_off,
             "enu": None if reference is None else reference.as_dict(),
         }
 
@@ -121,6 +125,13 @@ def tie(
         placed = placed.of(np.flatnonzero(used), problem.memory[used] * scale**2)
         final = placed.factors(up)
         values = solver.solve(final, values)
+        away = values.atPoint3(ANTENNA_KEY) - placed.antennas[0]
+        off = float(np.linalg.norm(away) / placed.antenna_sigmas[0])
+        if off**2 > LARGEST:  # it is not where it was said to be
+            wider = placed.antenna_sigmas * off / np.sqrt(MEDIAN)
+            placed = replace(placed, antenna_sigmas=wider)
+            final = placed.factors(up)
+            values = solver.solve(final, values)
         distances = np.linalg.norm(problem.placed.residuals(values), axis=1)
         if used.mean() < LEAST:
             return _refused(_disagree(used), problem, distances)
@@ -138,7 +149,9 @@ def tie(
     graph.tie(final, values)
     reference = GeoReference(problem.origin, earth.matrix(), np.asarray(covariance))
     antenna = values.atPoint3(ANTENNA_KEY)
-    return TiedFixes(reference, "", problem.stamps, used, distances, scale, antenna, placed)
+    elsewhere = off if off**2 > LARGEST else 0.0
+    seen = problem.stamps, used, distances, scale, antenna
+    return TiedFixes(reference, "", *seen, placed, elsewhere)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,6 +55,19 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes += [*result.imu.problems, *_uncovered(result, result.imu)]
     if result.fixes is not None and result.fixes.reference is None:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
+    if result.fixes is not None and result.fixes.antenna_off > 0.0:
+        notes.append(
+            f"by the fixes the antenna of the GNSS receiver is {result.fixes.antenna_off:.0f} of its "
+            "standard deviations from aiding.lidar_t_antenna: measure it (no motion may tell its "
+            "height)"
+        )
+    loops = None if result.loops is None else result.loops.graph
+    off = 0 if loops is None else len(loops.active) - sum(loops.active)
+    if loops is not None and off >= max(loops.config.believed_loops, sum(loops.active)):
+        notes.append(
+            f"{off} of {len(loops.active)} loops contradict the rest and are not used: places look "
+            "alike, or the odometry drifts more than it knows (pose_graph.walk)"
+        )
     if result.wheels_problem:
         notes.append(result.wheels_problem)
     if result.times_problem:

@@ -17,7 +17,7 @@ import numpy as np
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
-from loam_gtsam.errors import check_count, check_part
+from loam_gtsam.errors import check_part
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
@@ -227,14 +227,13 @@ class PartOf(ChangedDataset):
         begin_s: float | None = None,
         end_s: float | None = None,
     ) -> None:
-        check_count(start, "part: start")
-        check_count(every, "part: every")
         low = 0.0 if begin_s is None else begin_s
         high = np.inf if end_s is None else end_s
-        if start < 0 or every < 1 or not 0.0 <= low < high:
+        whole = all(isinstance(number, (int, np.integer)) for number in (start, every))
+        if not whole or start < 0 or every < 1 or not 0.0 <= low < high:
             raise InputError(
-                "part: expected start of 0 or more, every of 1 or more, and 0 <= begin < end; got "
-                f"start {start}, every {every}, begin {begin_s} s, end {end_s} s"
+                "part: expected a whole start of 0 or more, every of 1 or more, and 0 <= begin < "
+                f"end; got start {start}, every {every}, begin {begin_s} s, end {end_s} s"
             )
         said = [f"from sweep {start}"] if start else []
         said += [f"every {every}"] if every > 1 else []

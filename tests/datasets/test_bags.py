@@ -153,7 +153,7 @@ def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("recording", "problem"),
     [
-        ([*sweeps("ros1"), ("/imu", START, imu(ROS1, START, unknown=True))], "no orientation"),
+        ([*sweeps("ros1"), ("/imu", START, imu(ROS1, START, unknown=True))], "without orientation"),
         ([("/p", START, cloud(ROS1, START, sweep_points(0)))], "no per-point time"),
         (sweeps("ros1", 3, "/velodyne_cloud_registered"), "do not map them again"),
     ],
@@ -161,7 +161,8 @@ def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
 def test_what_a_bag_lacks_is_said(tmp_path: Path, recording: Recording, problem: str) -> None:
     dataset = BagDataset(write_bag(tmp_path / "run", "ros1", recording))
     assert dataset.imu is None or dataset.imu.orientation is None
-    assert any(problem in text for text in dataset.info().problems)
+    info = dataset.info()
+    assert any(problem in text for text in [*info.problems, *info.facts.values()])
     assert problem != "no per-point time" or [scan.times for scan in dataset] == [None]
 
 

@@ -223,7 +223,7 @@ def test_parts_of_a_data_set(world):
         assert part.name != world.name
         assert "sweeps" in part.info().facts["used"]
     for wrong in ({"start": -1}, {"every": 0}, {"begin_s": 3.0, "end_s": 2.0}):
-        with pytest.raises(InputError, match="part: expected start of 0 or more"):
+        with pytest.raises(InputError, match="part: expected a whole start of 0 or more"):
             world.part(**wrong)
     for none in ({"start": 8}, {"begin_s": 0.8}, {"begin_s": 0.21, "end_s": 0.29}):
         with pytest.raises(InputError, match=r"some of the 8 sweeps of .*, got none"):

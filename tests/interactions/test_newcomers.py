@@ -63,7 +63,7 @@ MISTAKES: list[tuple[Callable[[], object], str]] = [
     (lambda: run(SimulatedWorld), "dataset: expected a Dataset, got the class SimulatedWorld"),
     (lambda: run(WORLD, workers=-1), "workers: expected a whole number, 0 or more"),
     (lambda: run(WORLD, workers=2.5), "workers: expected a whole number, 0 or more"),
-    (lambda: WORLD.part(0.5), "start: expected a whole number"),
+    (lambda: WORLD.part(0.5), "part: expected a whole start of 0 or more, .* got start 0.5"),
     (lambda: localise(WORLD, "m.lgmap"), r"saved: .* got str; SavedMap\(path\) opens one"),
     (lambda: LoopClosure(None, None, gtsam.Pose3(), np.eye(6)), r"numbers of .* got NoneType"),
     (lambda: relative_covariance(X, X), "earlier: expected a MapUpdate, got ndarray"),

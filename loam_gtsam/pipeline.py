@@ -323,9 +323,9 @@ class Pipeline:
         """Tie the keyframes of a run to the fixes of a receiver, once the run is complete."""
         if self.loops is None:
             return
-        aid = self.mapper.imu
-        up = None if aid is None else aid.map_up
-        self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
+        up = None if self.mapper.imu is None else self.mapper.imu.map_up
+        with own_code("graph", "factors" if self.loops.graph.has_own_factors else None):
+            self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
@@ -470,6 +470,11 @@ def run(
         error = caught
     finally:
         progress.end()
-    if fixes is not None:
-        pipeline.tie_to_earth(updates, fixes)
+    try:
+        if fixes is not None:
+            pipeline.tie_to_earth(updates, fixes)
+    except PartError as caught:
+        if not keep_partial:
+            raise
+        error = error or caught
     return pipeline.result(updates, interrupted=interrupted, error=error)

@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from support.list_dataset import ListDataset
 from support.quick import QUICK
 
+from loam_gtsam import pipeline as pipeline_module
 from loam_gtsam.config import Config, ImuConfig, preset
 from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.frontend.features import extract_features
@@ -110,6 +112,21 @@ def test_an_error_in_the_data_is_raised_or_kept_with_the_partial_result():
     result = run(broken, QUICK, keep_partial=True)
     assert len(result.updates) == 2
     assert isinstance(result.error, DatasetError)
+
+
+def test_a_run_whose_fixes_cannot_be_tied_is_kept(monkeypatch):
+    def fails(*_):
+        raise PartError("graph", "factors", ValueError("mine"))
+
+    monkeypatch.setattr(pipeline_module, "tie", fails)
+    scans = list(SimulatedWorld("room", frames=2, columns=300))
+    fixes = GnssFixes(np.array([scan.stamp for scan in scans]), [[47.5, 8.5, 450.0]] * 2)
+    dataset, config = ArrayDataset(scans, gnss=fixes), QUICK.changed("aiding.gnss=true")
+    with pytest.raises(PartError, match="mine"):
+        run(dataset, config)
+    result = run(dataset, config, keep_partial=True)
+    assert len(result.updates) == 2
+    assert isinstance(result.error, PartError)
 
 
 def test_same_input_same_bits_at_any_speed():
@@ -565,6 +582,7 @@ def test_what_is_no_factor_of_the_frame_is_an_error(shaken, sweeps, extra, says)
     [
         (lambda values: (np.zeros(1), [np.zeros((1, 5))]), InputError),
         (lambda values: (np.full(1, np.nan), [np.zeros((1, 6))]), InputError),
+        (lambda values: (np.zeros(1), [np.full((1, 6), 1e12)]), InputError),
         (lambda values: 1 / 0, PartError),
     ],
 )

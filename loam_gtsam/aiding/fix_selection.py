@@ -6,10 +6,13 @@ whose distances are those along the way. Equations: docs/gnss.md.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import gtsam
 import numpy as np
 
 from loam_gtsam.aiding.placed_fixes import LARGEST, MEDIAN, PlacedFixes
+from loam_gtsam.loops.keyframes import odometry_between
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
@@ -41,7 +44,12 @@ class FixSelection:
     ) -> None:
         self._fixes, self._way, self._up = fixes, way, up
         self.rest = graph.active_factors()
-        self._values, self._config = graph.values, graph.config
+        self._values = graph.values
+        # How uncertain turn and place have become by the odometry, at the keyframe of each fix.
+        steps = [odometry_between(*ends, graph.config)[1] for ends in pairwise(graph.keyframes)]
+        grown = np.cumsum([np.zeros(2), *map(_turn_and_shift, steps)], axis=0)
+        numbers = [keyframe.index for keyframe in graph.keyframes]
+        self._drift = grown[np.searchsorted(numbers, fixes.poses)]
 
     def factors(self, spread: FloatArray, used: BoolArray) -> gtsam.NonlinearFactorGraph:
         """Factors of the ``used`` (N,) fixes, whose covariances are times ``spread`` (U,)."""
@@ -103,16 +111,13 @@ class FixSelection:
 
     def _as_far_apart(self, some: IntArray, others: IntArray) -> BoolArray:
         """(S, O) whether fixes are as far apart as the way is there, but for noise and drift."""
-        fixes, way, config = self._fixes.enu, self._way, self._config
-        travelled = np.cumsum(np.linalg.norm(np.diff(way, axis=0, prepend=way[:1]), axis=1))
-        gone = np.abs(travelled[some][:, None] - travelled[others])
         by_way, by_fixes = (
-            np.linalg.norm(places[some][:, None] - places[others], axis=2)
-            for places in (way, fixes)
+            np.linalg.norm(at[some][:, None] - at[others], axis=2)
+            for at in (self._way, self._fixes.enu)
         )
+        grown = np.abs(self._drift[some][:, None] - self._drift[others])
+        drift = grown[:, :, 1] + grown[:, :, 0] * by_way**2 / 3.0
         variances = np.linalg.eigvalsh(self._fixes.covariances)[:, -1]
-        turned = np.radians(config.turn_walk_deg) ** 2 * by_way**2 / 3.0
-        drift = gone * (config.walk**2 + turned)
         allowed = variances[some][:, None] + variances[others] + drift
         close: BoolArray = (by_way - by_fixes) ** 2 <= _APART * allowed
         return close
@@ -139,3 +144,9 @@ class FixSelection:
         values = found[0]
         squared = np.minimum(self._fixes.squared(values), LARGEST)
         return 2.0 * float(self.rest.error(values)) + float(squared.sum())
+
+
+def _turn_and_shift(covariance: FloatArray) -> FloatArray:
+    """(2,) variances of the rotation and of the translation of a motion (6, 6)."""
+    diagonal: FloatArray = np.diag(covariance).reshape(2, 3).sum(axis=1)
+    return diagonal

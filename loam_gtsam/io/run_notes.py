@@ -57,9 +57,9 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.fixes is not None and result.fixes.antenna_off > 0.0:
         notes.append(
-            f"by the fixes the antenna of the GNSS receiver is {result.fixes.antenna_off:.0f} of its "
-            "standard deviations from aiding.lidar_t_antenna: measure it (no motion may tell its "
-            "height)"
+            f"by the fixes the antenna of the GNSS receiver is {result.fixes.antenna_off:.0f} "
+            "standard deviations from aiding.lidar_t_antenna: measure it (its height as well, "
+            "which no motion may tell)"
         )
     loops = None if result.loops is None else result.loops.graph
     off = 0 if loops is None else len(loops.active) - sum(loops.active)

@@ -238,8 +238,7 @@ class LiveMapper:
                 self.fault(str(error))
         if self._must_wait(self._current, ended):
             return None
-        current, self._current = self._current, None
-        return self._map(current)
+        return self._map(self._current)
 
     def reset(self) -> None:
         """Begin a new run, e.g. after :attr:`loam_gtsam.types.SweepFault.CLOCK_SET_BACK`.
@@ -304,6 +303,7 @@ class LiveMapper:
                 rows = self._imu.take()
             self._imu.hand_over(rows, current.needs)
         update = self.pipeline.process(current.sweep)
+        self._current = None  # if a part of the user's own raises, the next step tries it again
         mapped = self._clock()
         if self._observe is not None:
             with self.pipeline.faults.forgiven(), own_code("observe", self._observe):

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.pose_graphs import SIGMAS
 from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
 
 from loam_gtsam.aiding.gnss import tie, write_enu
@@ -79,19 +80,21 @@ def test_wrong_fixes_are_rejected_and_bend_nothing(kind):
     assert np.abs(drive.errors() - clean.errors()).max() < 0.35
 
 
-def test_wrong_fixes_that_are_surer_than_the_way_do_not_bend_it_before_they_are_told():
-    """Ten seconds of multipath from a receiver that tells 2 cm."""
-    drive = Drive(sigma=0.02)
-    drive.enu[30:42] += [4.0, 3.0, 6.0]
-    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, None)
+@pytest.mark.parametrize("up", [None, UP])
+@pytest.mark.parametrize("off", [[4.0, 3.0, 6.0], [8.0, 3.0, 1.0], [2.0, 1.0, 2.0]])
+def test_wrong_fixes_that_are_surer_than_the_way_do_not_bend_it(off, up):
+    """Multipath of a receiver that tells 2 cm: the way bends to it, by graduated non-convexity."""
+    drive = Drive(sigma=0.02, step=3.0 * SIGMAS)
+    drive.enu[30:42] += off
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, up)
     assert np.array_equal(np.flatnonzero(~tied.used), np.arange(30, 42))
-    assert drive.errors().max() < 0.25
+    assert drive.errors().max() < 0.6
 
 
 def test_an_antenna_elsewhere_than_said_is_told_and_believed_less():
     there, elsewhere = Drive(sigma=0.02), Drive(sigma=0.02)
     right = tie(there.graph, there.updates, there.fixes(), CONFIG, UP)
-    aside = CONFIG.changed(lidar_t_antenna=tuple(ANTENNA + [1.0, 0.0, 0.0]))
+    aside = CONFIG.changed(lidar_t_antenna=tuple(ANTENNA + np.eye(3)[0]))
     wrong = tie(elsewhere.graph, elsewhere.updates, elsewhere.fixes(), aside, UP)
     assert right.antenna_off == 0.0
     assert wrong.antenna_off > 4.0

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.cli import loam
+from support.list_dataset import ListDataset
 from support.quick import begin_quickly
 from support.rooms_map import FRAMES, Mapped, world
 from support.worlds import OWN
@@ -19,6 +20,7 @@ from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
@@ -31,7 +33,15 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Field, Fit
 from loam_gtsam.registration.relocalization.evidence import Evidence
-from loam_gtsam.types import BadSweep, ConfigError, FrameStatus, InputError, MapUpdate
+from loam_gtsam.types import (
+    BadSweep,
+    ConfigError,
+    DatasetError,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    PartError,
+)
 
 NEAR = 0.06  # metres, of a pose in the map
 
@@ -439,6 +449,29 @@ def test_the_classical_systems_track_too_from_a_fix_of_the_default_solver(mapped
     assert found.config.solver.method == "aloam"
     off = errors(mapped, other_drive(mapped), found.solved)
     assert max(np.linalg.norm(error[3:]) for error in off) < NEAR
+
+
+def test_an_error_keeps_what_was_localised_and_a_part_that_raises_costs_its_sweep(mapped, saved):
+    drive = other_drive(mapped)
+    sweeps = [drive.sweep(n) for n in range(3)]
+    broken = ListDataset([*sweeps, DatasetError("disk gone")])
+    with pytest.raises(DatasetError, match="disk gone"):
+        localise(broken, saved)
+    found = localise(broken, saved, keep_partial=True)
+    assert len(found.updates) == 3
+    assert isinstance(found.error, DatasetError)
+
+    def features(scan):
+        if scan is sweeps[1]:
+            raise ValueError("mine")
+        return extract_features(scan, saved.config)
+
+    config = Localizer(saved).config
+    with pytest.raises(PartError, match="mine"):
+        localise(ListDataset(sweeps), saved, config, features=features)
+    lenient = Localizer(saved, config.changed("parts.on_error=continue"), features=features)
+    faulty = [lenient.process(sweep).status for sweep in sweeps]
+    assert faulty == [FrameStatus.LOST, FrameStatus.UNUSABLE_SCAN, FrameStatus.LOST]
 
 
 def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):

@@ -8,6 +8,7 @@ import pytest
 from support.jacobians import numerical
 
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
+from loam_gtsam.factors import checked_factor
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.refine.adjustment import refine
 from loam_gtsam.refine.elimination import eliminated, refitted, sightings
@@ -18,7 +19,7 @@ from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
 from loam_gtsam.registration.uncertainty import relative_covariance
-from loam_gtsam.types import DatasetError, FeatureSweep, InputError, Trajectory
+from loam_gtsam.types import DatasetError, FeatureSweep, InputError, PartError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)
 SECOND = 1_000_000_000
@@ -389,3 +390,20 @@ def test_the_data_set_of_another_run_is_refused(room) -> None:
     other = Trajectory.from_poses([1, 2, 3], [gtsam.Pose3()] * 3)
     with pytest.raises(InputError, match="stamps of the run's poses"):
         refine_run(points, result.updates[:3], trajectory=other)
+
+
+@pytest.mark.parametrize(
+    ("residual", "error"),
+    [
+        (lambda values: (np.full(3, np.nan), [np.zeros((3, 6))]), InputError),
+        (lambda values: (np.zeros(3), [1e12 * np.eye(3, 6)]), InputError),
+        (lambda values: 1 / 0, PartError),
+    ],
+)
+def test_a_faulty_factor_of_ones_own_is_refused(residual, error) -> None:
+    sweeps, _, poses = _scene(edges=_posts)
+    factors = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+    factors.add(checked_factor(noise, [gtsam.symbol("x", 1)], residual))
+    with pytest.raises(error, match="factors"):
+        refine(sweeps, poses, factors)

@@ -56,7 +56,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.ros.live import LiveMapper, LiveResult
 from loam_gtsam.ros.live_inputs import LiveImu
 from loam_gtsam.ros.live_report import OTHER_REASONS, LiveLog
-from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, SweepFault
+from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, PartError, SweepFault
 
 FRAMES = 11
 SHORT = 6
@@ -424,6 +424,25 @@ def test_what_waits_in_the_end_counts_and_is_mapped(bag: Path) -> None:
     assert [result.update.status for result in live.finish()] == ["first", "ok"]
     assert (live.report().waiting, live.report().without_imu) == (0, 2)
     assert live.finish() == []
+
+
+def test_a_sweep_at_which_a_part_raises_is_tried_again(bag: Path) -> None:
+    calls: list[None] = []
+
+    def once(_: Any) -> list[gtsam.NonlinearFactor]:
+        calls.append(None)
+        if len(calls) == 1:
+            raise ValueError("not yet")
+        return []
+
+    live = LiveMapper(QUICK, extra_factors=once, clock=Clock())
+    for message in [m for m in messages_of(bag) if m.topic == POINTS][:2]:
+        hand_over(live, message)
+    assert live.step() is not None
+    with pytest.raises(PartError, match="not yet"):
+        live.step()
+    assert live.report().waiting == 1
+    assert [result.update.status for result in live.finish()] == ["ok"]
 
 
 def test_sweeps_wait_for_samples_by_the_clock_that_is_put_right() -> None:

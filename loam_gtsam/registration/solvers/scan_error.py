@@ -148,8 +148,7 @@ def scan_error(
     if expected is None:  # of a solver that does not say: all priors along weak directions
         weak = np.eye(6) - keep
         expected = weak.T @ priors @ weak
-    units = np.sqrt(np.maximum(np.diag(total), np.finfo(float).tiny))  # a factor may be very sure
-    if np.linalg.matrix_rank(total / np.outer(units, units), hermitian=True) < len(total):
+    if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
     by_ground, since = seen.cells(points, facings(rows.normals, lines), config.ground_cell)
     new = since == seen.scans

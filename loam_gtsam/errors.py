@@ -25,7 +25,6 @@ DAMAGED: tuple[type[Exception], ...] = (
     RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What numpy and zipfile raise at a file of arrays that is damaged, or holds something else."""
-_ROUNDED = 1e-6  # seconds by which times of single precision may be off
 _LONGEST = 80  # characters of a name that is looked for among others
 _INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM begins
 
@@ -83,25 +82,13 @@ def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(part).__name__}{lacks}")
 
 
-def checked_span(value: object, times: NDArray[Any] | None) -> tuple[float, float]:
-    """The span of a sweep; InputError unless two numbers in order hold most of its finite times."""
+def are_two_numbers(value: object) -> bool:
+    """Whether it is a pair of numbers that numpy understands."""
     try:
         numbers = np.asarray(value)
     except ValueError:
-        numbers = np.zeros(0)
-    two = numbers.shape == (2,) and numbers.dtype.kind in "iuf"
-    if not (two and numbers[0] <= numbers[1]):
-        raise InputError(f"Scan.span: expected (first, last) seconds, got {value!r}")
-    first, last = map(float, numbers)
-    if times is not None:
-        finite = np.isfinite(times)
-        inside = (times >= first - _ROUNDED) & (times <= last + _ROUNDED)
-        if 2 * np.count_nonzero(inside) < np.count_nonzero(finite):
-            raise InputError(
-                f"Scan.span: expected the times, {times[finite].min():.6g} to "
-                f"{times[finite].max():.6g} s, within it, got {first:.6g} to {last:.6g} s"
-            )
-    return first, last
+        return False
+    return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
 
 
 def check_array(

@@ -28,7 +28,7 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
-from loam_gtsam.errors import as_stamps, checked_span
+from loam_gtsam.errors import are_two_numbers, as_stamps
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
 from loam_gtsam.trajectory import Trajectory as Trajectory
@@ -64,7 +64,7 @@ class Scan:
     Raises
     ------
     InputError
-        If a shape or a dtype is wrong, or most times are outside the span.
+        If a shape or a dtype is wrong.
     """
 
     points: NDArray[np.floating]
@@ -85,7 +85,9 @@ class Scan:
             if column is not None:
                 check_array(column, f"Scan.{name}", (len(self.points),), numbers)
         if self.span is not None:
-            object.__setattr__(self, "span", checked_span(self.span, self.times))
+            if not are_two_numbers(self.span):
+                raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
+            object.__setattr__(self, "span", tuple(map(float, self.span)))
         if not (_is_integer(self.rows) and self.rows >= 0):
             raise InputError(f"Scan.rows: expected a number of rows, or 0, got {self.rows!r}")
         if self.rows and len(self.points) % self.rows:

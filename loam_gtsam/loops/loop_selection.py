@@ -20,8 +20,8 @@ from loam_gtsam.types import BoolArray, FloatArray
 
 _LIKELY = 12.6  # squared Mahalanobis distance that 95 % of right loop closures do not exceed
 _DRIFT = np.radians(0.02), 0.01
-"""rad and metres a metre of way, by which an odometry may be off beyond its covariance. LOAM has 0.55
-% and 0.0013 degrees a metre on KITTI (Zhang and Singh, Autonomous Robots 41, 2017)."""
+"""rad and metres a metre of way, by which an odometry may be off beyond its covariance. LOAM has
+0.55 % and 0.0013 degrees a metre on KITTI (Zhang and Singh, Autonomous Robots 41, 2017)."""
 _SWITCHES = 50  # largest number of loop closures that are switched one by one after a new one
 
 

@@ -324,7 +324,7 @@ class Pipeline:
         if self.loops is None:
             return
         up = None if self.mapper.imu is None else self.mapper.imu.map_up
-        with own_code("graph", "factors" if self.loops.graph.has_own_factors else None):
+        with self.loops.graph.own_code():
             self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:

@@ -143,10 +143,7 @@ def stack_poses(poses: Iterable[gtsam.Pose3]) -> NDArray[np.float64]:
 def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
     """The pose itself; InputError for anything else, or if its rotation is none."""
     check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
-    rotation = value.rotation().matrix()
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        determinant = np.linalg.det(rotation)
+    off, determinant = _off_rotations(value.rotation().matrix())
     if not (off <= _ROUNDED and determinant > 0.0):
         raise InputError(
             f"{name}: expected a rotation of orthogonal unit axes and determinant 1, got one that "
@@ -156,13 +153,18 @@ def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
     return value
 
 
+def _off_rotations(matrices: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """How far the products of axes of (..., 3, 3) are from those of unit axes; determinants."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = matrices @ matrices.swapaxes(-1, -2)
+        return np.abs(products - np.eye(3)).max(axis=(-2, -1)), np.linalg.det(matrices)
+
+
 def check_poses(poses: NDArray[Any], name: str) -> None:
     """InputError if a matrix of (N, 4, 4) is no pose, as far as it is not NaN; digits may lack."""
-    rotations = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        bad = (off > _DIGITS) | (np.linalg.det(rotations) < 0.0)
-        bad |= (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) > _DIGITS).any(axis=1)
+    off, determinants = _off_rotations(poses[:, :3, :3])
+    bad = (off > _DIGITS) | (determinants < 0.0)
+    bad |= (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) > _DIGITS).any(axis=1)
     if bad.any():
         raise InputError(
             f"{name}: expected matrices [R t; 0 0 0 1] with rotations R, got {bad.sum()} others of "

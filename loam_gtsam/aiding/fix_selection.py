@@ -51,8 +51,8 @@ class FixSelection:
         numbers = [keyframe.index for keyframe in graph.keyframes]
         self._drift = grown[np.searchsorted(numbers, fixes.poses)]
 
-    def factors(self, spread: FloatArray, used: BoolArray) -> gtsam.NonlinearFactorGraph:
-        """Factors of the ``used`` (N,) fixes, whose covariances are times ``spread`` (U,)."""
+    def factors(self, spread: FloatArray | float, used: BoolArray) -> gtsam.NonlinearFactorGraph:
+        """Factors of the ``used`` (N,) fixes; covariances times ``spread``, of each (U,) or all."""
         return self._fixes.of(np.flatnonzero(used), spread).factors(self._up)
 
     def solve(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
@@ -76,8 +76,8 @@ class FixSelection:
         # Where wrong fixes are surer than the way, it bends to them before they can be told.
         rigid = self._rigid()
         if LEAST <= rigid.mean() < 1.0:
-            alone = self.factors(np.ones(int(rigid.sum())), rigid)
-            found.append(self._settled(self.solve(alone, start), rigid))
+            alone = self.solve(self.factors(1.0, rigid), start)
+            found.append(self._settled(alone, rigid))
         values, used, scale = min(found, key=self._cost)
         if not used.any():
             raise RuntimeError("no fix agrees with the way")
@@ -117,7 +117,7 @@ class FixSelection:
         )
         grown = np.abs(self._drift[some][:, None] - self._drift[others])
         drift = grown[:, :, 1] + grown[:, :, 0] * by_way**2 / 3.0
-        variances = np.linalg.eigvalsh(self._fixes.covariances)[:, -1]
+        variances = self._fixes.sigmas**2
         allowed = variances[some][:, None] + variances[others] + drift
         close: BoolArray = (by_way - by_fixes) ** 2 <= _APART * allowed
         return close
@@ -132,8 +132,7 @@ class FixSelection:
         for _ in range(_ROUNDS):
             if used.sum() < FEWEST:
                 break
-            spread = np.full(int(used.sum()), scale)
-            values = self.solve(self.factors(spread, used), values)
+            values = self.solve(self.factors(scale, used), values)
             before, used = used, self._fixes.squared(values) <= scale * LARGEST
             if (before == used).all():
                 break

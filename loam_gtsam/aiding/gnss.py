@@ -16,7 +16,14 @@ import numpy as np
 
 from loam_gtsam.aiding.alignment import align
 from loam_gtsam.aiding.fix_selection import FEWEST, LEAST, FixSelection
-from loam_gtsam.aiding.placed_fixes import ANTENNA_KEY, LARGEST, MAP_KEY, MEDIAN, PlacedFixes
+from loam_gtsam.aiding.placed_fixes import (
+    ANTENNA_KEY,
+    LARGEST,
+    MAP_KEY,
+    MEDIAN,
+    UPWARD,
+    PlacedFixes,
+)
 from loam_gtsam.aiding.placed_fixes import fix_factor as fix_factor
 from loam_gtsam.config import AidingConfig
 from loam_gtsam.datasets.decode.aiding import GnssFixes
@@ -34,7 +41,6 @@ from loam_gtsam.types import (
 )
 
 _HEADING = 0.2  # rad: with a larger standard deviation the heading counts as unknown
-_UPWARD = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +81,17 @@ class TiedFixes:
             f"(median); x axis of the map {self.reference.heading_deg:.1f} degrees from east"
         )
 
+    @property
+    def antenna_problem(self) -> str:
+        """A sentence on an antenna that is not where it was said to be; empty if it is."""
+        if self.antenna_off == 0.0:
+            return ""
+        return (
+            f"by the fixes the antenna of the GNSS receiver is {self.antenna_off:.0f} standard "
+            "deviations from aiding.lidar_t_antenna: measure it (its height as well, which no "
+            "motion may tell)"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Numbers for a JSON file."""
         reference, antenna = self.reference, self.antenna
@@ -110,9 +127,9 @@ def tie(
     problem = _Fixes.of(graph, updates, fixes, config)
     if isinstance(problem, str):
         return _refused(problem)
-    top = _UPWARD if up is None else up
+    top = UPWARD if up is None else up
     placed = problem.placed
-    start = align(problem.way, placed.enu, problem.sigmas, top, levelled=up is not None)
+    start = align(problem.way, placed.enu, placed.sigmas, top, levelled=up is not None)
     if start is None:
         return _refused(
             "the way is too short for the accuracy of the fixes to tell a heading", problem
@@ -127,7 +144,8 @@ def tie(
         values = solver.solve(final, values)
         away = values.atPoint3(ANTENNA_KEY) - placed.antennas[0]
         off = float(np.linalg.norm(away) / placed.antenna_sigmas[0])
-        if off**2 > LARGEST:  # it is not where it was said to be
+        off = off if off**2 > LARGEST else 0.0
+        if off > 0.0:  # it is not where it was said to be
             wider = placed.antenna_sigmas * off / np.sqrt(MEDIAN)
             placed = replace(placed, antenna_sigmas=wider)
             final = placed.factors(up)
@@ -149,9 +167,8 @@ def tie(
     graph.tie(final, values)
     reference = GeoReference(problem.origin, earth.matrix(), np.asarray(covariance))
     antenna = values.atPoint3(ANTENNA_KEY)
-    elsewhere = off if off**2 > LARGEST else 0.0
     seen = problem.stamps, used, distances, scale, antenna
-    return TiedFixes(reference, "", *seen, placed, elsewhere)
+    return TiedFixes(reference, "", *seen, placed, off)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,11 +238,6 @@ class _Fixes:
     def way(self) -> FloatArray:
         """(N, 3) positions of the antenna in the map before the fixes are used."""
         return np.array([pose.transformFrom(self.placed.antennas[0]) for pose in self.poses])
-
-    @property
-    def sigmas(self) -> FloatArray:
-        """(N,) metres, along the worst axis."""
-        return np.asarray(np.sqrt(np.linalg.eigvalsh(self.placed.covariances)[:, -1]))
 
 
 def _disagree(used: BoolArray) -> str:

@@ -23,7 +23,7 @@ ANTENNA_KEY: int = gtsam.symbol("a", 0)
 LARGEST = 16.27  # of chi squared with three degrees of freedom, 0.1 % of right fixes exceed it
 MEDIAN = 2.366  # of chi squared with three degrees of freedom
 _LEVEL, _LEANING = 0.02, 0.3  # rad: of the z axis of the map, if the IMU levelled it, and if not
-_UPWARD = np.array([0.0, 0.0, 1.0])
+UPWARD = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +52,11 @@ class PlacedFixes:
     def __len__(self) -> int:
         return len(self.poses)
 
+    @property
+    def sigmas(self) -> FloatArray:
+        """(N,) standard deviations along the worst axis, metres."""
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariances)[:, -1]))
+
     def factors(self, up: FloatArray | None) -> gtsam.NonlinearFactorGraph:
         """As factors; ``up`` (3,) is upward in the map, or None if no IMU levelled it.
 
@@ -64,8 +69,8 @@ class PlacedFixes:
             noise, moved = noise_model(covariance, 3), gtsam.Pose3(move)
             graph.add(fix_factor(pose_key(pose), enu, noise, moved, ANTENNA_KEY + receiver))
         level = gtsam.noiseModel.Isotropic.Sigma(2, _LEANING if up is None else _LEVEL)
-        top = gtsam.Unit3(_UPWARD if up is None else up)
-        graph.add(gtsam.AttitudeFactorPose3(MAP_KEY, gtsam.Unit3(_UPWARD), level, top))
+        top = gtsam.Unit3(UPWARD if up is None else up)
+        graph.add(gtsam.AttitudeFactorPose3(MAP_KEY, gtsam.Unit3(UPWARD), level, top))
         for number, (place, sigma) in enumerate(self._antennas()):
             known = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
             graph.add(gtsam.PriorFactorPoint3(ANTENNA_KEY + number, place, known))

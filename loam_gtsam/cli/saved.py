@@ -137,8 +137,7 @@ def localise_in_map(options: LocaliseOptions) -> int:
     nothing = f"{dataset.name}: none of the {len(found.updates)} sweeps could be used"
     if not found.fixes:
         typer.echo(f"no fix: the data do not fit {path}, or are too short", err=True)
-    code = console.exit_code(found.error, stop, found.updates, nothing)
-    return code or int(not found.fixes)
+    return console.exit_code(found.error, stop, found.updates, nothing) or int(not found.fixes)
 
 
 def _summary(found: Localisation, dataset: Dataset, path: Path) -> dict[str, Any]:

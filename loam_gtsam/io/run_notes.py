@@ -13,6 +13,7 @@ from loam_gtsam.types import FrameStatus, MapUpdate, SweepMotion
 
 if TYPE_CHECKING:
     from loam_gtsam.aiding.imu_summary import ImuSummary
+    from loam_gtsam.loops.pose_graph import PoseGraph
     from loam_gtsam.pipeline import RunResult
 
 DO_NOT_TRUST = "DO NOT TRUST THIS RUN: "
@@ -55,19 +56,10 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes += [*result.imu.problems, *_uncovered(result, result.imu)]
     if result.fixes is not None and result.fixes.reference is None:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
-    if result.fixes is not None and result.fixes.antenna_off > 0.0:
-        notes.append(
-            f"by the fixes the antenna of the GNSS receiver is {result.fixes.antenna_off:.0f} "
-            "standard deviations from aiding.lidar_t_antenna: measure it (its height as well, "
-            "which no motion may tell)"
-        )
-    loops = None if result.loops is None else result.loops.graph
-    off = 0 if loops is None else len(loops.active) - sum(loops.active)
-    if loops is not None and off >= max(loops.config.believed_loops, sum(loops.active)):
-        notes.append(
-            f"{off} of {len(loops.active)} loops contradict the rest and are not used: places look "
-            "alike, or the odometry drifts more than it knows (pose_graph.walk)"
-        )
+    if result.fixes is not None and result.fixes.antenna_problem:
+        notes.append(result.fixes.antenna_problem)
+    if result.loops is not None:
+        notes += _on_loops(result.loops.graph)
     if result.wheels_problem:
         notes.append(result.wheels_problem)
     if result.times_problem:
@@ -76,6 +68,18 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(result.range_offset.problem)
     few = result.config.solver.method == "aloam"  # associations, by its design
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT), few))
+
+
+def _on_loops(graph: PoseGraph) -> list[str]:
+    """A sentence on loops that are not used, if there are many, and most are not."""
+    on = sum(graph.active)
+    off = len(graph.active) - on
+    if off < max(graph.config.believed_loops, on):
+        return []
+    return [
+        f"{off} of {len(graph.active)} loops contradict the rest and are not used: places look "
+        "alike, or the odometry drifts more than it knows (pose_graph.walk)"
+    ]
 
 
 def _uncovered(result: RunResult, imu: ImuSummary) -> list[str]:

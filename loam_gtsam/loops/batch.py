@@ -6,7 +6,7 @@ is tested against all the others. Equations: docs/maths/pose_graph.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -212,37 +212,51 @@ class _Problem:
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FloatArray]:
         """Factors that were used, poses, and distance (L,) of each loop closure from the others."""
         graph = self.factors(active)
-        poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, _silent()).optimize()
-        if not self.loops:
-            return graph, poses, np.empty(0)
-        marginals = gtsam.Marginals(graph, poses)
-        distances = []
-        for place, on in zip(self.loops, active.tolist(), strict=True):
-            factor: Any = _without_kernel(self.saved.factors.at(place))
-            known = relative_pose(poses, marginals, *factor.keys())
-            noise = factor.noiseModel().covariance()
-            distances.append(chi_squared(factor.measured(), noise, *known, included=on))
+        poses = self._optimised(graph)
+        pairs = zip(self._compared(graph, poses), active.tolist(), strict=True)
+        distances = [chi_squared(*motions, included=on) for (_, motions), on in pairs]
         return graph, poses, np.array(distances)
+
+    def _compared(
+        self, graph: gtsam.NonlinearFactorGraph, poses: gtsam.Values
+    ) -> Iterator[tuple[list[int], tuple[gtsam.Pose3, FloatArray, gtsam.Pose3, FloatArray]]]:
+        """Of each loop closure its keys, and its motion beside that of a solved graph.
+
+        Both with their covariances, as :func:`chi_squared` takes them.
+        """
+        if not self.loops:
+            return
+        marginals = gtsam.Marginals(graph, poses)
+        for place in self.loops:
+            factor: Any = _without_kernel(self.saved.factors.at(place))
+            keys, noise = factor.keys(), factor.noiseModel().covariance()
+            yield keys, (factor.measured(), noise, *relative_pose(poses, marginals, *keys))
 
     def possible(self) -> BoolArray:
         """Which loop closures a drift of the odometry allows; all if only loops tie the poses."""
-        possible = np.ones(len(self.loops), np.bool_)
-        graph, keys = self.factors(~possible), self.saved.keys
+        everyone = np.ones(len(self.loops), np.bool_)
+        if not self.loops:
+            return everyone
+        graph, keys = self.factors(~everyone), self.saved.keys
         try:
-            poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, _silent()).optimize()
-            marginals = gtsam.Marginals(graph, poses)
+            poses = self._optimised(graph)
+            compared = list(self._compared(graph, poses))
         except RuntimeError:
-            return possible
+            return everyone
         places = np.array([poses.atPose3(key).translation() for key in keys])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
         way = dict(zip(keys, np.concatenate([[0.0], np.cumsum(steps)]).tolist(), strict=True))
-        for number, place in enumerate(self.loops):
-            factor: Any = _without_kernel(self.saved.factors.at(place))
-            first, second = factor.keys()
-            known, noise = relative_pose(poses, marginals, first, second), factor.noiseModel()
-            seen = factor.measured(), noise.covariance()
-            possible[number] = may_be_drift(*seen, *known, abs(way[second] - way[first]))
-        return possible
+        possible = [
+            may_be_drift(*motions, abs(way[second] - way[first]))
+            for (first, second), motions in compared
+        ]
+        return np.array(possible, np.bool_)
+
+    def _optimised(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
+        params = gtsam.LevenbergMarquardtParams()
+        params.setVerbosityLM("SILENT")
+        params.setRelativeErrorTol(1e-9)
+        return gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, params).optimize()
 
     def inliers(self) -> BoolArray:
         """Which loop closures graduated non-convexity finds right, given all other factors."""
@@ -265,13 +279,6 @@ class _Problem:
         weights = np.asarray(optimizer.getWeights())[list(self.loops)]
         inliers: BoolArray = weights > _INLIER
         return inliers
-
-
-def _silent() -> gtsam.LevenbergMarquardtParams:
-    params = gtsam.LevenbergMarquardtParams()
-    params.setVerbosityLM("SILENT")
-    params.setRelativeErrorTol(1e-9)
-    return params
 
 
 def _without_kernel(factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:

@@ -6,7 +6,6 @@ older keyframes lie elsewhere, seen from the newest one, their map points move t
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from copy import deepcopy
 
 import gtsam
@@ -77,7 +76,7 @@ class LoopMapping:
         """
         aid = self._mapper.imu
         self.graph.imu = None if aid is None else aid.trusted_gyro  # which the mapper may give up
-        with self._own_factors():
+        with self.graph.own_code():
             keyframe = self.graph.add(update, features)
         if keyframe is None:
             return False
@@ -89,21 +88,18 @@ class LoopMapping:
             if found is not None:
                 check_kind(found, LoopClosure, "what detect returns", "None if there is no loop")
             loop = found
-        with self._own_factors():
+        with self.graph.own_code():
             is_closed = loop is not None and self.graph.add_loop(loop)
         if is_closed:
             config = self._config.pose_graph
             self.correct_map(config.follow_distance, config.follow_angle_deg)
         # What ties a graph without loops, as a receiver does in the end, ties every visit anew.
-        with self._own_factors():
+        with self.graph.own_code():
             place = None if isinstance(self.closer, NoLoops) else self.graph.visit()
         if place is not None:  # the points to come belong to a keyframe that stays
             self._mapper.maps.keyframe = place
             del self._placed[keyframe.index]
         return is_closed
-
-    def _own_factors(self) -> AbstractContextManager[None]:
-        return own_code("graph", "factors" if self.graph.has_own_factors else None)
 
     def correct_map(self, metres: float = 0.0, degrees: float = 0.0) -> None:
         """Move the map points of keyframes that lie elsewhere, seen from the newest, by more.

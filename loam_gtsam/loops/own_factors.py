@@ -6,12 +6,14 @@ GTSAM ends the process, or leaves iSAM2 broken, on some of what is refused here.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loam_gtsam.errors import own_code
 from loam_gtsam.geometry import as_vector
 from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import Keyframe, is_pose_key, noise_model, numbered
@@ -88,6 +90,10 @@ class FactorGraph:
     def has_own_factors(self) -> bool:
         """Whether there may be factors beside those of odometry and loop closures."""
         return self._graph.has_own_factors
+
+    def own_code(self) -> AbstractContextManager[None]:
+        """A block that evaluates factors of a user's own: what they raise is a PartError."""
+        return own_code("graph", "factors" if self.has_own_factors else None)
 
     @property
     def own(self) -> Sequence[int]:

@@ -341,8 +341,8 @@ class Localisation:
     updates : one per sweep
     fixes : number of times that the pose was found by a search in the whole map
     interrupted : stopped (Ctrl-C) before the data set ended
-    error : what ended it before; None if nothing did
     localizer : as it is after the last sweep
+    error : what ended it before its end; None if nothing did
     """
 
     config: Config
@@ -423,5 +423,4 @@ def localise(
         if not (keep_partial and updates):
             raise
         error = caught
-    done = localizer.fixes, interrupted, localizer, error
-    return Localisation(localizer.config, updates, *done)
+    return Localisation(localizer.config, updates, localizer.fixes, interrupted, localizer, error)

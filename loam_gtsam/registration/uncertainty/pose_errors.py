@@ -50,9 +50,11 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     InputError
         If a frame was not solved, or ``later`` is not later than ``earlier``.
     """
-    begins = getattr(earlier, "status", None) is FrameStatus.FIRST
-    for name, update in (("earlier", earlier), ("later", later)):
+    both = ("earlier", earlier), ("later", later)
+    for name, update in both:
         check_kind(update, MapUpdate, name, "the updates of a run are such")
+    begins = earlier.status is FrameStatus.FIRST
+    for name, update in both:
         if update.uncertainty is None and not (begins and update is earlier):
             raise InputError(
                 f"{name}: expected a frame that was solved, got one with status {update.status}; "

@@ -124,8 +124,7 @@ class Features:
     edge_rings, plane_rings : integer beam numbers.
     level_rings : whether beams sweep rings about the lidar's z axis, which edges cross. Those of a
         Livox swing up and down, and a lidar that is mounted askew has others
-    sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
-        (used by scan-to-scan odometry).
+    sharp, flat : indices of the most pronounced edges and planes, for scan-to-scan odometry.
     span : (first, last) seconds from ``stamp`` covered by the sweep.
     edge_prominence : (E,) metres by which an edge stands out of its ring, scaled so that range
         noise alone gives it the standard deviation of the noise
@@ -134,10 +133,10 @@ class Features:
         are apart, and pass beside the edge itself; None if unknown: edges are where they were met
     not_finite : points of the sweep that were NaN or infinite
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
-        point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points, or
-        points that were moved since.
+        point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points.
     reach : metres; three quarters of the points of the sweep are nearer, which tells whether the
         place is small (``map.small_below``). Infinite if unknown: the place then counts as open.
+    ring_elevations : (R,) rad, mean elevations of rings about the lidar's z axis; None if unknown
     """
 
     stamp: int
@@ -156,6 +155,7 @@ class Features:
     not_finite: int = 0
     voxel_sizes: tuple[float, float] | None = None
     reach: float = np.inf
+    ring_elevations: FloatArray | None = None
 
     def __post_init__(self) -> None:
         _check_stamp(self)

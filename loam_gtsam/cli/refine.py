@@ -133,9 +133,11 @@ class FinishedRun:
         check_data(folder, dataset)
         if updates is None:
             updates = read_updates(folder / "run.npz")
-        config, ranges = load_config(folder / "config.yaml"), summary_in(folder).get("ranges")
-        if isinstance(ranges, dict) and "advised_offset_m" in ranges:
-            config = config.changed({"sensor.range_offset": ranges["advised_offset_m"]})
+        config, summary = load_config(folder / "config.yaml"), summary_in(folder)
+        told = {"range_offset": ("ranges", "advised_offset_m"), "beams": ("beams", "advised")}
+        for key, (part, name) in told.items():
+            if isinstance(known := summary.get(part), dict) and name in known:
+                config = config.changed({f"sensor.{key}": known[name]})
         return FinishedRun(folder, dataset, updates, config)
 
     @property

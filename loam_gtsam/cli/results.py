@@ -14,6 +14,7 @@ import numpy as np
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.io.atomic import write_text
 from loam_gtsam.io.checkpoint import checksum
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
@@ -21,6 +22,7 @@ from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.maps.map_file import MAP_FILE, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
+from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
 from loam_gtsam.studies import evaluation
 from loam_gtsam.types import (
     DatasetError,
@@ -40,6 +42,8 @@ ERROR_PLOT = "errors.png"
 TRUTH_FILE, MATCHED_FILE = "truth.tum", "truth_matched.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
 ENU_FILE = "trajectory_enu.tum"
+BEAMS_FILE = "beams.yaml"
+"""A configuration of what the beams of the lidar are off by, if they are."""
 BASE_FILES = (*RUN_FILES, MAP_FILE)
 """What every run writes."""
 RUN_OUTPUTS = (
@@ -50,6 +54,7 @@ RUN_OUTPUTS = (
     TRUTH_FILE,
     MATCHED_FILE,
     ENU_FILE,
+    BEAMS_FILE,
 )
 
 
@@ -109,6 +114,7 @@ class Results:
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
         if self.run.pipeline is not None:
             save_map(folder / MAP_FILE, self.run.pipeline)
+            files += _write_beams(folder / BEAMS_FILE, self.run.pipeline.mapper.beam_errors)
         if self.run.fixes is not None and self.run.fixes.reference is not None:
             write_enu(folder / ENU_FILE, self.run.trajectory, self.run.fixes.reference)
             files.append(ENU_FILE)
@@ -260,3 +266,13 @@ def _input_checksum(dataset: Dataset) -> str:
 
 def _described(info: DatasetInfo) -> str:
     return f"{info.kind} {info.path}"
+
+
+def _write_beams(path: Path, errors: BeamErrors) -> list[str]:
+    """Write what ``sensor.beams`` should be, if it is not that; the names of files written."""
+    if not errors.problem:
+        return []
+    rows = "".join(f"  - {list(row)}\n" for row in errors.advised)
+    said = "# degrees; metres by which ranges are too long; elevations, azimuths too large, degrees"
+    write_text(path, f"sensor:\n  {said}\n  beams:\n{rows}")
+    return [path.name]

@@ -126,7 +126,9 @@ class Section(BaseModel):
             near = nearest(error["input"], choices, listing=False)
             return (key,), f"expected one of {', '.join(choices)}; got {given}{near}"
         if isinstance(field.default, tuple) and (len(error["loc"]) == 1 or kind == "missing"):
-            return (key,), f"expected {len(choices)} values, got {given}"
+            rows = Ellipsis in choices  # any number of them
+            count = len(get_args(choices[0]) if rows else choices)
+            return (key,), f"expected {'rows of ' if rows else ''}{count} values, got {given}"
         expected = _EXPECTED.get(kind, "a valid value").format(**error.get("ctx", {}))
         if kind == "bool_type" and isinstance(error["input"], str):
             expected = "true or false (other words, as yes, are text in YAML 1.2)"

@@ -42,6 +42,11 @@ class SensorConfig(Section):
     """All ranges are too long by this, and are made shorter. The end of a run says by how much they
     look too long: a driver may count them from another point of the lidar than its centre."""
 
+    beams: tuple[tuple[Angle, Offset, Angle, Angle], ...] = parameter(())
+    """Errors of single beams: of each its elevation (degrees), by how much its ranges are too long
+    (m), and its elevations and azimuths too large (degrees). They are taken from its points. A run
+    in which they show writes them to beams.yaml."""
+
 
 class FeatureConfig(Section):
     """Scan registration: the choice of edge and plane features among the points of a sweep."""

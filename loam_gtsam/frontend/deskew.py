@@ -48,6 +48,7 @@ class MovingSweep:
     alone : (E,) whether it is a pole, which stands before all that is beside it; None if unknown
     edge_sigmas : (E,) metres, standard deviation of its place along its ring; None if unknown
     level_rings : whether beams sweep rings about the lidar's z axis
+    ring_elevations : (R,) rad, of these rings; None if unknown
     motion : source of the rotation within the sweep
     acceleration : (6,) rad/s^2 and m/s^2, of the body velocity; None if that is constant
     not_finite : number of points of the sweep that were NaN or infinite
@@ -72,6 +73,7 @@ class MovingSweep:
         depth = config.features.post_depth or np.inf
         self.alone: BoolArray | None = None if prominence is None else prominence > depth
         self.edge_sigmas, self.level_rings = features.edge_sigmas, features.level_rings
+        self.ring_elevations = features.ring_elevations
         self._points = features.edges, features.planes
         times = features.edge_times, features.plane_times
         self._seconds = times[0] - self.middle, times[1] - self.middle
@@ -145,6 +147,10 @@ class MovingSweep:
         sweep = copy(self)
         sweep.acceleration = acceleration
         return sweep
+
+    def measured_planes(self, rows: IntArray) -> FloatArray:
+        """Chosen planes (M, 3) as the lidar measured them, metres, not de-skewed."""
+        return self._points[1].take(rows, axis=0)
 
     def later(self, nanoseconds: int) -> MovingSweep:
         """The sweep on a clock that was set ahead by so much."""

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import SMALL, Config, MapConfig
+from loam_gtsam.frontend.beams import elevations_of, without_beam_errors
 from loam_gtsam.frontend.curvature import (
     UNIFORM_SIGMA,
     curvature,
@@ -79,7 +80,7 @@ def extract_features(scan: Scan, config: Config) -> Features:
         the message says what was found and what to set.
     """
     _keep_freed_memory()
-    sweep = organise(scan, config)
+    sweep = without_beam_errors(organise(scan, config), config.sensor.beams)
     if not sweep.rings.known:
         return _without_rings(scan, config, sweep)
     xyz, ring_starts, settings = sweep.xyz, sweep.ring_starts, config.features
@@ -299,6 +300,7 @@ def _assemble(
     ends, apart = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, width)
     edge_points = ends if width < 1.0 else measured(edges)[0]
     with_poles = np.concatenate((edges, poles.middles))
+    level = are_level(sweep.xyz, sweep.ring_starts)
     return Features(
         stamp=scan.stamp + round(reference * 1e9),
         edges=np.concatenate((edge_points, poles.points)),
@@ -312,7 +314,8 @@ def _assemble(
         span=(span[0] - reference, span[1] - reference),
         edge_prominence=np.concatenate((stands_out, poles.depths)),
         edge_sigmas=np.concatenate((UNIFORM_SIGMA * apart, poles.sigmas)),
-        level_rings=are_level(sweep.xyz, sweep.ring_starts),
+        level_rings=level,
+        ring_elevations=elevations_of(sweep.xyz, sweep.ring_starts) if level else None,
         not_finite=sweep.not_finite,
         reach=reach,
     )

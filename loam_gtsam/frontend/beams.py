@@ -1,0 +1,89 @@
+"""Errors of single beams, as ``sensor.beams`` tells them, are taken from the points of these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.frontend.organise import OrganisedSweep
+from loam_gtsam.types import FloatArray, IntArray, SweepError, SweepFault
+
+BeamRow = tuple[float, float, float, float]
+"""Elevation of a beam, degrees; its ranges are too long by this, metres; elevation and azimuth of
+its points are too large by this, degrees."""
+
+
+class Rays(NamedTuple):
+    """How points move with errors of their beams, each (N, 3) and in the frame of the lidar.
+
+    Attributes
+    ----------
+    by_range : unit vectors, by each metre of range
+    by_elevation, by_azimuth : metres, by each rad
+    """
+
+    by_range: FloatArray
+    by_elevation: FloatArray
+    by_azimuth: FloatArray
+
+    @classmethod
+    def of(cls, points: NDArray[np.floating]) -> Rays:
+        """Of points (N, 3), metres; those on the axis of the lidar have no azimuth."""
+        x, y, z = np.asarray(points, np.float64).T
+        flat = np.maximum(np.hypot(x, y), 1e-9)
+        ranges = np.hypot(flat, z)
+        by_range = np.stack((x, y, z)) / ranges
+        by_elevation = np.stack((-z * x / flat, -z * y / flat, flat))
+        return cls(by_range.T, by_elevation.T, np.stack((-y, x, np.zeros_like(x))).T)
+
+
+def elevations_of(xyz: NDArray[np.float32], ring_starts: IntArray) -> FloatArray:
+    """(R,) mean elevations of rings, rad, of points (3, N) that lie ring after ring."""
+    slopes = xyz[2] / np.maximum(np.hypot(xyz[0], xyz[1]), np.float32(1e-6))
+    sums = np.add.reduceat(slopes, ring_starts[:-1], dtype=np.float64)
+    means: FloatArray = np.arctan(sums / np.diff(ring_starts))
+    return means
+
+
+def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> OrganisedSweep:
+    """The sweep without the errors of its beams; a ring that is none of ``beams`` stays as it is.
+
+    A ring is that of the beam with the nearest elevation, no farther than half way to the next.
+
+    Raises
+    ------
+    SweepError
+        If there are no rings.
+    """
+    if not beams:
+        return sweep
+    if not sweep.rings.known:
+        raise SweepError(
+            f"sensor.beams tells errors of {len(beams)} beams, but there are {sweep.rings.note}; "
+            "set sensor.rings, or leave sensor.beams out",
+            SweepFault.BAD_RINGS,
+        )
+    table = np.array(sorted(beams), np.float64)
+    elevations = np.degrees(elevations_of(sweep.xyz, sweep.ring_starts))
+    away = np.abs(elevations[:, None] - table[:, 0])
+    nearest = away.argmin(axis=1)
+    apart = np.diff(table[:, 0]).min() if len(table) > 1 else 1.0
+    errors = np.where((away.min(axis=1) <= 0.5 * apart)[:, None], table[nearest, 1:], 0.0)
+    errors[:, 1:] = np.radians(errors[:, 1:])
+    each = np.repeat(errors, np.diff(sweep.ring_starts), axis=0)
+    return replace(sweep, xyz=moved(sweep.xyz.T, -each).T.astype(np.float32))
+
+
+def moved(points: NDArray[np.floating], errors: FloatArray) -> FloatArray:
+    """Points (N, 3) with errors (N, 3) of range, elevation and azimuth: metres, rad and rad."""
+    x, y, z = np.asarray(points, np.float64).T
+    ranges = np.sqrt(x * x + y * y + z * z) + errors[:, 0]
+    elevation = np.arctan2(z, np.hypot(x, y)) + errors[:, 1]
+    azimuth = np.arctan2(y, x) + errors[:, 2]
+    flat = ranges * np.cos(elevation)
+    parts = flat * np.cos(azimuth), flat * np.sin(azimuth), ranges * np.sin(elevation)
+    return np.ascontiguousarray(np.stack(parts, axis=1))

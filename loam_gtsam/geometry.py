@@ -13,6 +13,7 @@ from scipy.special import chdtri, ndtr
 
 from loam_gtsam.errors import as_stamps as as_stamps
 from loam_gtsam.trajectory import checked_pose as checked_pose
+from loam_gtsam.trajectory import is_rigid as is_rigid
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
 
 _Real = TypeVar("_Real", np.float32, np.float64)

@@ -131,9 +131,8 @@ def cross_matrix(vector: FloatArray) -> FloatArray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-# What follows works on component arrays, points last: one pass over contiguous memory per operation,
-# several times faster than (N, 3, 3) stacks. A symmetric 3 x 3 matrix is (6, N): xx, yy, zz, xy, yz,
-# xz.
+# Component arrays, points last: one pass over contiguous memory per operation, several times faster
+# than (N, 3, 3) stacks. A symmetric 3 x 3 matrix is (6, N): xx, yy, zz, xy, yz, xz.
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -9,10 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.peers import KissIcp, KissVariant, load, timed_points
 from loam_gtsam.config import Config
@@ -275,8 +273,8 @@ def run_case(case: Case, peers: bool = True) -> CaseResult:
     truth = _truth(case, dataset, trajectory)
     if isinstance(dataset, LoamTopicsDataset) and dataset.recorded is not None:
         # The C++ systems publish a first pose before they have mapped anything.
-        recorded = _part(dataset.recorded, np.arange(1, len(dataset.recorded)))
-        trajectory = _part(trajectory, np.isin(trajectory.stamps, recorded.stamps))
+        recorded = dataset.recorded[1:]
+        trajectory = trajectory[np.isin(trajectory.stamps, recorded.stamps)]
     error = absolute_error(trajectory, truth)
     found = [
         PeerResult(
@@ -342,10 +340,6 @@ def _truth(case: Case, dataset: Dataset, trajectory: Trajectory) -> Trajectory:
     if truth is None:
         raise DatasetError(f"{case.name}: {case.source} comes without reference poses")
     return truth
-
-
-def _part(trajectory: Trajectory, which: NDArray[Any]) -> Trajectory:
-    return Trajectory(trajectory.stamps[which], trajectory.map_T_lidar[which])
 
 
 def _median_and_tail(column: FloatArray) -> tuple[float, float]:

@@ -20,7 +20,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.tables import markdown_table, write_csv
+from benchmarks.tables import markdown_table, write_rows
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
@@ -376,8 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     detections = [row for detected, _ in found for row in detected]
     outcomes = [row for _, outcome in found for row in outcome]
     for name, rows in (("detectors", detections), ("policies", outcomes)):
-        columns_of = [item.name for item in fields(rows[0])]
-        write_csv(options.output / f"{name}.csv", columns_of, map(astuple, rows), digits=4)
+        write_rows(options.output / f"{name}.csv", rows)
     print(table(detections), table(outcomes), sep="\n\n")
     return 0
 

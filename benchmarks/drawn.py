@@ -182,7 +182,7 @@ def _measured(
     """Map both drives, look for the second one in the map of the first, and merge the maps."""
     cut = int(rng.integers(len(first) // 2, len(first) + 1))
     disturbed, start = Disturbed(second, faults), int(rng.integers(0, cut))
-    later = PartOf(disturbed, min(start, len(disturbed) - 1), 1, None, None)
+    later = PartOf(disturbed, min(start, len(disturbed) - 1), 1)
     runs = run(first, config, max_frames=cut), run(later, config)
     map_T_world = _start(runs[0], first)
     found = [

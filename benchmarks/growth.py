@@ -31,7 +31,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.datasets.sim.world import build_avenue
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
-from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.studies.evaluation import absolute_error, distance_travelled
 from loam_gtsam.types import FloatArray, MapUpdate, Trajectory
 
 STAGES = ("features", "odometry", "prepare", "match", "solve", "insert", "covariance")
@@ -74,7 +74,7 @@ class Drive:
         scene = build_avenue(0, max(1e3 * self.kilometres, 1.2 * self.frames) + _SPARE)
         frames = self.frames
         if not frames:
-            driven = _driven(SimulatedWorld(scene).truth)
+            driven = distance_travelled(SimulatedWorld(scene).truth.positions)
             frames = int(np.searchsorted(driven, 1e3 * self.kilometres)) + 1
         return SimulatedWorld(scene, frames=frames, columns=self.columns)
 
@@ -93,7 +93,7 @@ def measure(drive: Drive) -> GrowthResult:
     world = drive.open()
     config = effective_config(Config().changed(map=drive.map), world)
     pipeline = Pipeline(config, imu=imu_buffer(world, config))
-    driven = _driven(world.truth)
+    driven = distance_travelled(world.truth.positions)
     updates: list[MapUpdate] = []
     rows = np.full((len(world), len(COLUMNS)), np.nan)
     with processor_clock():
@@ -114,8 +114,8 @@ def measure(drive: Drive) -> GrowthResult:
     while_mapping = memory()[1]
     maps = pipeline.mapper.maps.edges, pipeline.mapper.maps.planes
     whole = pipeline.mapper.map_points()
-    poses = np.array([update.map_T_lidar.matrix() for update in updates])
-    found = Trajectory(np.array([update.stamp for update in updates], np.int64), poses)
+    stamps, poses = zip(*((update.stamp, update.map_T_lidar) for update in updates), strict=True)
+    found = Trajectory.from_poses(stamps, poses)
     return GrowthResult(
         name=drive.scene,
         columns=dict(zip(COLUMNS, rows.T, strict=True)),
@@ -156,12 +156,6 @@ def _bytes(value: object) -> int:
     elif isinstance(value, Mapping):
         parts = list(value.values())
     return sys.getsizeof(value) + sum(map(_bytes, parts))
-
-
-def _driven(truth: Trajectory) -> FloatArray:
-    steps = np.linalg.norm(np.diff(truth.map_T_lidar[:, :3, 3], axis=0), axis=1)
-    driven: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
-    return driven
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -80,7 +80,7 @@ def write_aided(path: Path, frames: int) -> None:
 
     world, store = SimulatedWorld("street_loop", frames=frames, columns=450), bags.ROS1
     truth, recording = world.truth, []
-    places = geodetic_of(truth.map_T_lidar[:, :3, 3], np.array([47.5, 8.5, 450.0]))
+    places = geodetic_of(truth.positions, np.array([47.5, 8.5, 450.0]))
     turns = Rotation.from_matrix(truth.map_T_lidar[:, :3, :3]).as_quat()
     for scan, pose, place, turn in zip(world, truth.map_T_lidar, places, turns, strict=True):
         assert scan.times is not None

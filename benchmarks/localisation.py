@@ -150,7 +150,7 @@ def tracked(
     saved: SavedMap, drive: SimulatedWorld, map_T_world: FloatArray, *, inside: bool = False
 ) -> tuple[float, FloatArray, float, float]:
     """ATE and (N, 6) errors of a stretch, and NEES/6 with and without the map's own error."""
-    part = PartOf(drive, len(drive) // 3, 1, None, None)
+    part = PartOf(drive, len(drive) // 3, 1)
     result = localise(part, saved, max_frames=min(200, len(part)), inside=inside)
     updates = result.solved
     errors = np.array([error_in_map(u, drive, map_T_world) for u in updates]).reshape(-1, 6)

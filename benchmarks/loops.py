@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -20,7 +20,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.tables import write_csv
+from benchmarks.tables import write_rows
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld, build_city
 from loam_gtsam.frontend.workers import extract
@@ -29,8 +29,8 @@ from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config, run
-from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.types import Features, FloatArray, MapUpdate, Scan, Trajectory
+from loam_gtsam.studies.evaluation import absolute_error, distance_travelled
+from loam_gtsam.types import Features, FloatArray, MapUpdate, Scan, Trajectory, stack_poses
 
 DRIFTS = (0.0, 0.005, 0.01, 0.02)
 """Shares of the way."""
@@ -41,6 +41,7 @@ NEAR = 5.0
 RIGHT = (0.5, np.radians(3.0))
 """Metres and rad by which a right loop may be off."""
 FALSE_LOOPS = 50
+_WITHOUT_IMU = Config().changed("imu.coupling=off")
 _RESULTS = Path("benchmarks/results/loops")
 
 
@@ -94,10 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         drifts = DRIFTS[-1:] if options.quick else DRIFTS
         job = partial(drive, metres=metres, columns=columns, drifts=drifts)
         rows = [row for part in pool.map(job, seeds) for row in part]
-    names = [item.name for item in fields(Row)]
-    write_csv(
-        options.output / "loops.csv", names, ([getattr(row, n) for n in names] for row in rows)
-    )
+    write_rows(options.output / "loops.csv", rows, digits=6)
     print("\n".join(table(rows)))
     return 0
 
@@ -107,7 +105,7 @@ def drive(seed: int, metres: float, columns: int, drifts: Sequence[float]) -> li
     world = SimulatedWorld(
         "street_loop", seed=seed, columns=columns, speed=20.0, frames=int(metres / 1.7) + 100
     )
-    config = effective_config(_without_imu(), world)
+    config = effective_config(_WITHOUT_IMU, world)
     mapper, frames = Mapper(config), []
     made = 0.0
     for sweep in _until(world, metres):
@@ -151,7 +149,7 @@ def _closed(
         for k, old in ((k, way[k] - way >= config.loops.min_way) for k in range(len(way)))
     ]
     ends = {loop.later for loop in used}
-    before = np.array([keyframe.odom_T_lidar.matrix() for keyframe in graph.keyframes])
+    before = stack_poses(keyframe.odom_T_lidar for keyframe in graph.keyframes)
     after = _ate(graph.poses(), truth[numbers])
     rng = np.random.default_rng([seed, 1])
     for loop in false_loops(len(graph), FALSE_LOOPS, rng):
@@ -231,8 +229,7 @@ def city(path: Path) -> Iterator[str]:
     scene = build_city(np.column_stack([poses[:, 2], -poses[:, 0]]))
     world = SimulatedWorld(scene, columns=600, speed=14.0)
     for enabled in (True, False):
-        config = _without_imu()
-        config = config.changed({"loops.enabled": enabled})
+        config = _WITHOUT_IMU.changed({"loops.enabled": enabled})
         result = run(world, config, workers=1)
         error = absolute_error(result.trajectory, world.truth)
         length = world.truth.path_length
@@ -253,15 +250,10 @@ def city(path: Path) -> Iterator[str]:
 
 def _until(world: SimulatedWorld, metres: float) -> Iterator[Scan]:
     """The sweeps of the first so many metres."""
-    steps = np.linalg.norm(np.diff(world.truth.map_T_lidar[:, :3, 3], axis=0), axis=1)
-    count = int(np.searchsorted(np.cumsum(steps), metres)) + 1
+    driven = distance_travelled(world.truth.positions)
+    count = int(np.searchsorted(driven[1:], metres)) + 1
     for number in range(min(count, len(world))):
         yield world[number]
-
-
-def _without_imu() -> Config:
-    config = Config()
-    return config.changed("imu.coupling=off")
 
 
 def _is_wrong(loop: LoopClosure, poses: Sequence[gtsam.Pose3]) -> bool:

@@ -17,7 +17,7 @@ from loam_gtsam.datasets import ArrayDataset, open_dataset
 from loam_gtsam.frontend.rings import rings_from_elevation
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration.odometry import Guess
+from loam_gtsam.registration.odometry import Guess, Odometry
 from loam_gtsam.types import DatasetError, Features, FloatArray, MapUpdate, Scan, Trajectory
 
 MAPPING = ("prepare", "match", "solve", "insert")
@@ -82,11 +82,11 @@ def read_timing(path: Path) -> tuple[float, float]:
     return float(np.median(milliseconds[:, -1])), float(np.median(milliseconds.sum(axis=1)))
 
 
-def measure_all(data: Path, rivals: Sequence[Rival] = RIVALS) -> list[RivalResult]:
+def measure_all(data: Path) -> list[RivalResult]:
     """Map the sweeps of each rival whose files are in the data folder."""
     ours: dict[str, tuple[float, float]] = {}
     results = []
-    for rival in rivals:
+    for rival in RIVALS:
         if not all((data / name).exists() for name in (rival.timing, rival.source)):
             continue
         if rival.source not in ours:
@@ -163,7 +163,7 @@ def given_poses(folder: Path) -> Trajectory:
     return Trajectory(np.round(table[:, 0] * 1e9).astype(np.int64), poses)
 
 
-class GivenSteps:
+class GivenSteps(Odometry):
     """The odometry by the steps between given poses.
 
     From one of the hand-held sweeps to the next the lidar turns by up to 40 degrees, which no
@@ -182,9 +182,3 @@ class GivenSteps:
             step = self._poses[last.stamp].between(self._poses[features.stamp])
             pose = last.map_T_lidar.compose(step)
         return Guess(pose, np.zeros(6))
-
-    def remember(self, features: Features) -> None:
-        """Nothing."""
-
-    def reset(self) -> None:
-        """Nothing."""

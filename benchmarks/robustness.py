@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.peers import KissIcp, load, timed_points
-from benchmarks.tables import write_csv
+from benchmarks.tables import write_rows
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -263,7 +263,7 @@ def measure(task: tuple[Place, str], data: Path) -> list[Measured]:
         numbers = np.searchsorted(truth.stamps, starts)
         inside = trajectory.stamps <= truth.stamps[-1]
         clear = inside & ~np.isin(numbers, case.unclear)
-        compared = Trajectory(trajectory.stamps[clear], trajectory.map_T_lidar[clear])
+        compared = trajectory[clear]
         error = absolute_error(compared, truth)
         errors = np.full(len(truth) + case.cut, np.nan)
         before = case.events[:1] or (0,)
@@ -299,8 +299,7 @@ def _from_the_start(trajectory: Trajectory, truth: Trajectory) -> FloatArray:
 def write(folder: Path, rows: Sequence[Row]) -> Path:
     """``robustness.csv``; its path."""
     path = folder / "robustness.csv"
-    names = [item.name for item in fields(Row)]
-    write_csv(path, names, ([getattr(row, name) for name in names] for row in rows))
+    write_rows(path, rows, digits=6)
     return path
 
 

@@ -34,7 +34,15 @@ from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.io.run_files import summarise
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
 from loam_gtsam.studies.evaluation import FIVE_SIGMA, absolute_error, squared_errors
-from loam_gtsam.types import BoolArray, FloatArray, FrameStatus, IntArray, MapUpdate, Trajectory
+from loam_gtsam.types import (
+    BoolArray,
+    FloatArray,
+    FrameStatus,
+    IntArray,
+    MapUpdate,
+    Trajectory,
+    stack_poses,
+)
 from loam_gtsam.view.plots import available, plot_curves
 
 FRAMES, QUICK = 10_000, 300
@@ -200,7 +208,7 @@ def _errors(
     updates: Sequence[MapUpdate], numbers: IntArray, solved: BoolArray, world: SimulatedWorld
 ) -> tuple[FloatArray, float]:
     """Metres each solved frame is off after alignment, NaN for the others; the ATE of all."""
-    found = np.array([update.map_T_lidar.matrix() for update in updates])[solved]
+    found = stack_poses(update.map_T_lidar for update in updates)[solved]
     stamps = world.truth.stamps[numbers[solved]]  # whatever the sweeps said
     absolute = absolute_error(Trajectory(stamps, found), world.truth)
     errors = np.full(len(updates), np.nan)

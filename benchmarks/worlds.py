@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby
+from itertools import groupby, starmap
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,8 @@ from loam_gtsam.datasets import ArrayDataset, Dataset, SimulatedWorld, open_data
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.pipeline import RunResult, run
-from loam_gtsam.studies import evaluation
-from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error
-from loam_gtsam.types import FloatArray, FrameStatus, LoamError, MapUpdate, Trajectory
+from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error, squared_errors
+from loam_gtsam.types import FloatArray, FrameStatus, LoamError, Trajectory, stack_poses
 
 WINDOWS = (1, 10, 50)
 """Frames over which the error of a motion is held against its covariance."""
@@ -264,19 +263,20 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
     moved = [updates[0].map_T_lidar.between(update.map_T_lidar) for update in updates]
     exact = [true[0].between(pose) for pose in true]
     errors = np.array([a.localCoordinates(b) for a, b in zip(moved, exact, strict=True)])
-    starts = (np.array([pose.matrix() for pose in poses[:_START]]) for poses in (moved, exact))
+    starts = (stack_poses(poses[:_START]) for poses in (moved, exact))
     seconds = [sum(t for name, t in update.timings.items() if name != "read") for update in updates]
     nees: dict[str, FloatArray] = {}
     broken = 0
     for window in (*WINDOWS, START):  # that since the start is the last, and judged once more
         found = squared_errors(updates, true, window)
-        nees[name_of(window)] = np.array([value for value in found.values() if value is not None])
-        broken += list(found.values()).count(None)
-    far = [k for k, value in found.items() if value is None or value > FIVE_SIGMA]
+        squared = np.array(list(found.values()))
+        nees[name_of(window)] = squared[np.isfinite(squared)]
+        broken += int(np.isinf(squared).sum())
+    far = [k for k, value in found.items() if value > FIVE_SIGMA]
     good = sum(updates[k].status is FrameStatus.OK for k in far)
     return replace(
         row,
-        path=Trajectory(truth.stamps, truth.map_T_lidar).path_length,
+        path=truth.path_length,
         ate=absolute_error(result.trajectory, truth).rmse,
         start_deg=float(np.degrees(tilts(*starts).max())),
         start_m=float(np.linalg.norm(errors[:_START, 3:], axis=1).max()),
@@ -288,14 +288,6 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
         statuses=dict(Counter(str(update.status) for update in updates)),
         ms=1e3 * float(np.median(seconds)),
     )
-
-
-def squared_errors(
-    updates: Sequence[MapUpdate], true: Sequence[gtsam.Pose3], window: int
-) -> dict[int, float | None]:
-    """As :func:`loam_gtsam.studies.evaluation.squared_errors`; None for what is no covariance."""
-    found = evaluation.squared_errors(updates, true, window)
-    return {k: value if np.isfinite(value) else None for k, value in found.items()}
 
 
 def tilts(estimate: FloatArray, truth: FloatArray) -> FloatArray:
@@ -417,10 +409,6 @@ def read(path: Path) -> list[Row]:
     return [Row(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
 
 
-def _job(job: tuple[World, Mode, int]) -> Row:
-    return measure(*job)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; 1 if a run ended early."""
     every = [world for group in GROUPS.values() for world in group]
@@ -458,9 +446,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ]
     if options.workers > 1:
         with ProcessPoolExecutor(options.workers) as pool:
-            rows = list(pool.map(_job, jobs))
+            rows = list(pool.map(measure, *zip(*jobs, strict=True)))
     else:
-        rows = [_job(job) for job in jobs]
+        rows = list(starmap(measure, jobs))
     text = table(rows, read(options.against) if options.against else ())
     print(text)
     options.output.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ from scipy.special import chdtri, ndtr
 
 from loam_gtsam.errors import as_stamps as as_stamps
 from loam_gtsam.trajectory import checked_pose as checked_pose
+from loam_gtsam.trajectory import is_rigid as is_rigid
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
 
 _Real = TypeVar("_Real", np.float32, np.float64)
@@ -124,14 +125,14 @@ def move_points(
     return np.ascontiguousarray(moved.T)
 
 
-# Fits work on component arrays, points last: one pass over contiguous memory per operation, several
-# times faster than (N, 3, 3) stacks. A symmetric 3 x 3 matrix is (6, N): xx, yy, zz, xy, yz, xz.
-
-
 def cross_matrix(vector: FloatArray) -> FloatArray:
     """(3, 3) matrix that takes a vector to its cross product with (3,) ``vector``, on the left."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+# Component arrays, points last: one pass over contiguous memory per operation, several times faster
+# than (N, 3, 3) stacks. A symmetric 3 x 3 matrix is (6, N): xx, yy, zz, xy, yz, xz.
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -341,7 +342,7 @@ def voxel_filter(points: NDArray[np.floating], size: float, *, oblique: bool = F
         keys = np.unique(cells.T, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
-    first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
+    first = run_starts(keys[1:] != keys[:-1])
     rows = points.take(order, axis=0)
     sums = np.add.reduceat(rows.astype(np.float64, copy=False), first, axis=0)
     counts = np.diff(np.append(first, len(keys)))

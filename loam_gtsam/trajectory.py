@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
 
-_DIGITS = 1e-2  # that may lack in the matrices of a file
-_ROUNDED = 1e-5  # by which numbers of a rotation may be rounded
+_OF_FILES = 1e-2  # by which the axes of a rotation may be off in a file, which has few digits
+_OF_POSES = 1e-5  # and in a pose that a user gives
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -144,7 +144,7 @@ def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
     """The pose itself; InputError for anything else, or if its rotation is none."""
     check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
     off, determinant = _off_rotations(value.rotation().matrix())
-    if not (off <= _ROUNDED and determinant > 0.0):
+    if not (off <= _OF_POSES and determinant > 0.0):
         raise InputError(
             f"{name}: expected a rotation of orthogonal unit axes and determinant 1, got one that "
             f"is {off:.2g} off, with determinant {determinant:.3g}; gtsam.Rot3.ClosestTo(matrix) "
@@ -160,11 +160,20 @@ def _off_rotations(matrices: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         return np.abs(products - np.eye(3)).max(axis=(-2, -1)), np.linalg.det(matrices)
 
 
+def is_rigid(matrices: NDArray[Any]) -> NDArray[np.bool_]:
+    """(...,) whether matrices (..., 4, 4) are rigid transforms, as far as a file has their digits.
+
+    A matrix that is not finite is none.
+    """
+    off, determinants = _off_rotations(matrices[..., :3, :3])
+    last = np.abs(matrices[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(axis=-1)
+    rigid: NDArray[np.bool_] = (off <= _OF_FILES) & (determinants > 0.0) & (last <= _OF_FILES)
+    return rigid
+
+
 def check_poses(poses: NDArray[Any], name: str) -> None:
-    """InputError if a matrix of (N, 4, 4) is no pose, as far as it is not NaN; digits may lack."""
-    off, determinants = _off_rotations(poses[:, :3, :3])
-    bad = (off > _DIGITS) | (determinants < 0.0)
-    bad |= (np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]) > _DIGITS).any(axis=1)
+    """InputError if a matrix of (N, 4, 4) is no pose; NaN stands for what is not known."""
+    bad = ~is_rigid(np.where(np.isnan(poses), np.eye(4), poses))
     if bad.any():
         raise InputError(
             f"{name}: expected matrices [R t; 0 0 0 1] with rotations R, got {bad.sum()} others of "

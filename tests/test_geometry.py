@@ -34,10 +34,6 @@ def packed(matrices):
     return matrices[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]].T
 
 
-def random_rotation(rng):
-    return gtsam.Rot3.Expmap(rng.normal(size=3)).matrix()
-
-
 def same_axis(a, b):
     """Sine of the angle between unit vectors, whose signs are arbitrary; (3, N) each."""
     return np.linalg.norm(np.cross(a, b, axis=0), axis=0)

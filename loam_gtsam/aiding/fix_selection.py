@@ -47,7 +47,8 @@ class FixSelection:
         self._values = graph.values
         # How uncertain turn and place have become by the odometry, at the keyframe of each fix.
         steps = [odometry_between(*ends, graph.config)[1] for ends in pairwise(graph.keyframes)]
-        grown = np.cumsum([np.zeros(2), *map(_turn_and_shift, steps)], axis=0)
+        added = [np.diag(covariance).reshape(2, 3).sum(axis=1) for covariance in steps]
+        grown = np.cumsum([np.zeros(2), *added], axis=0)
         numbers = [keyframe.index for keyframe in graph.keyframes]
         self._drift = grown[np.searchsorted(numbers, fixes.poses)]
 
@@ -143,9 +144,3 @@ class FixSelection:
         values = found[0]
         squared = np.minimum(self._fixes.squared(values), LARGEST)
         return 2.0 * float(self.rest.error(values)) + float(squared.sum())
-
-
-def _turn_and_shift(covariance: FloatArray) -> FloatArray:
-    """(2,) variances of the rotation and of the translation of a motion (6, 6)."""
-    diagonal: FloatArray = np.diag(covariance).reshape(2, 3).sum(axis=1)
-    return diagonal

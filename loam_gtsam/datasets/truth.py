@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.datasets.decode import tables
-from loam_gtsam.datasets.decode.extrinsics import is_rigid, moved_to_lidar
+from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.geometry import inverse_pose
@@ -83,10 +83,9 @@ def extrinsic(text: str) -> FloatArray:
             numbers += [0.0, 0.0, 0.0, 1.0]
         if len(numbers) == 7:
             return tables.pose_matrix(numbers)
-        matrix = np.vstack([np.reshape(numbers[:12], (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-        if len(numbers) in (12, 16) and is_rigid(matrix):
-            return matrix
-        raise ValueError(f"{len(numbers)} numbers that are no rigid transform")
+        if len(numbers) in (12, 16):
+            return tables.rigid_matrix(numbers[:12])
+        raise ValueError(f"{len(numbers)} numbers")
     except ValueError as error:
         raise DatasetError(
             "extrinsic: expected x y z, x y z qx qy qz qw, or the 12 numbers of a 3 x 4 matrix, "

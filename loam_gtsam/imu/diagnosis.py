@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import integrated
+from loam_gtsam.geometry import integrated, interpolated
 from loam_gtsam.imu.at_rest import RestWindow
 from loam_gtsam.imu.quaternions import inverse, logarithm, quaternion_product, rotate
 from loam_gtsam.types import FloatArray, ImuSamples, IntArray
@@ -201,8 +201,7 @@ def _in_time(
     turned = integrated(samples.gyro, times)
 
     def gyro(shift: float) -> FloatArray:
-        ends = ((spans - origin) * 1e-9 + shift).T
-        first, last = (np.stack([np.interp(end, times, c) for c in turned.T], 1) for end in ends)
+        first, last = interpolated(((spans - origin) * 1e-9 + shift).T, times, turned)
         turns: FloatArray = last - first
         return turns
 

@@ -157,8 +157,7 @@ class LoopMapping:
     def corrected_maps(self) -> MapPair:
         """A copy of the mapper's maps in which all keyframes are where the graph has them."""
         maps = deepcopy(self._mapper.maps)
-        placed, pose = self._placed, self.graph.pose
-        maps.move({n: pose(n).compose(at.inverse()).matrix() for n, at in placed.items()})
+        maps.move(self._moves({index: self.graph.pose(index) for index in self._placed}))
         return maps
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:

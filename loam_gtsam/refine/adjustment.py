@@ -25,6 +25,7 @@ from loam_gtsam.refine.rounds import (
     Settings,
     Ties,
     adjusted,
+    check_factors,
     equations,
     factorised,
 )
@@ -197,6 +198,9 @@ def refine(
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
     known: tuple[Ties, ...] = (*ties, *(() if fixes is None else (fixes,)))
+    for graph in (factors, for_covariances):
+        if graph is not None:
+            check_factors(graph, poses)
     others = OtherFactors(factors, poses, known=known)
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     asked = np.tile(np.eye(6), (len(sweeps), 1, 1))

@@ -197,12 +197,34 @@ class Ties(Protocol):
         """Information (6 K, 6 K) and gradient (6 K,) there."""
 
 
+def _values(poses: FloatArray, first: int = 0) -> gtsam.Values:
+    """Poses (N, 4, 4) under their keys, ``gtsam.symbol("x", first)`` and the next ones."""
+    values = gtsam.Values()
+    for number, pose in enumerate(poses, first):
+        values.insert(gtsam.symbol("x", number), gtsam.Pose3(pose))
+    return values
+
+
+def check_factors(factors: gtsam.NonlinearFactorGraph, map_T_middle: FloatArray) -> None:
+    """InputError unless all are finite, and on ``gtsam.symbol("x", n)`` of poses (N, 4, 4)."""
+    values = _values(map_T_middle)
+    for place in range(factors.size()):
+        factor = factors.at(place)
+        if not all(map(values.exists, factor.keys())):
+            raise InputError(
+                f"factors: factor {place} has a key that is not x0 to x{len(map_T_middle) - 1}, "
+                "the poses of the sweeps"
+            )
+        with own_code("factors", f"factor {place}"):
+            check_finite(factor, values, "factors")
+
+
 class OtherFactors:
     """What ties the poses beside what the sweeps see, and the anchor they may need.
 
     Parameters
     ----------
-    factors : on the poses ``gtsam.symbol("x", n)`` of N sweeps in a row
+    factors : on the poses ``gtsam.symbol("x", n)`` of N sweeps in a row (:func:`check_factors`)
     map_T_middle : (N, 4, 4) their poses
     first : number ``n`` of the first of them
     known : what landmarks that were eliminated before, and fixes, tell of the poses
@@ -219,20 +241,10 @@ class OtherFactors:
         self.known, self._first, self._count = known, first, len(map_T_middle)
         self.ties = [ties.numbers.tolist() for ties in known]
         held: list[int] = []
-        values = self._values(map_T_middle)
-        last = first + self._count - 1
         for place in range(self.graph.size()):
             keys: list[int] = self.graph.at(place).keys()
             numbers = [gtsam.symbolIndex(key) - first for key in keys]
-            good = [gtsam.symbol("x", first + n) for n in numbers if 0 <= n < self._count]
-            if good != keys:
-                raise InputError(
-                    f"factors: factor {place} has a key that is not x{first} to x{last}, the "
-                    "poses of the sweeps"
-                )
             self.ties.append(numbers)
-            with own_code("factors", f"factor {place}"):
-                check_finite(self.graph.at(place), values, "factors")
             held += numbers if len(numbers) == 1 else []
         self.held = held or [0]
         self._anchor = None if held else gtsam.Pose3(map_T_middle[0])
@@ -245,15 +257,10 @@ class OtherFactors:
                 graph.add(self.graph.at(place))
         return OtherFactors(graph, map_T_middle, self._first + start)
 
-    def _values(self, poses: FloatArray) -> gtsam.Values:
-        values = gtsam.Values()
-        for number, pose in enumerate(poses, self._first):
-            values.insert(gtsam.symbol("x", number), gtsam.Pose3(pose))
-        return values
-
     def error(self, poses: FloatArray) -> float:
         """Cost of the factors."""
-        total = 0.0 if not self.graph.size() else float(self.graph.error(self._values(poses)))
+        values = _values(poses, self._first)
+        total = 0.0 if not self.graph.size() else float(self.graph.error(values))
         if self._anchor is not None:
             off = gtsam.Pose3.Logmap(self._anchor.between(gtsam.Pose3(poses[0])))
             total += 0.5 * float(off @ off) / _ANCHOR**2
@@ -262,7 +269,7 @@ class OtherFactors:
     def equations(self, poses: FloatArray) -> tuple[csc_array, FloatArray]:
         """Information (6 N, 6 N) and gradient (6 N,)."""
         parts = [(ties.numbers, *ties.equations(poses)) for ties in self.known]
-        values = self._values(poses)
+        values = _values(poses, self._first)
         for place in range(self.graph.size()):
             linear: Any = self.graph.at(place).linearize(values)
             if linear is None:

@@ -44,6 +44,7 @@ from loam_gtsam.types import (
     SweepMotion,
     Trajectory,
     check_kind,
+    stack_poses,
 )
 
 _SEEN = (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
@@ -149,8 +150,7 @@ class RefinedRun:
     @property
     def trajectory(self) -> Trajectory:
         """One pose per frame that has one, at the stamps of the run, in the frame of the first."""
-        every = self.refined.trajectory
-        return Trajectory(every.stamps[self._rows], every.map_T_lidar[self._rows])
+        return self.refined.trajectory[self._rows]
 
     @property
     def earth(self) -> GeoReference | None:
@@ -341,7 +341,7 @@ class _Run:
             raise InputError(f"updates: {got}")
         frames = tuple(updates[number] for number in points.frames)
         stamps = np.array([update.stamp for update in frames], np.int64)
-        poses = np.array([update.map_T_lidar.matrix() for update in frames])
+        poses = stack_poses(update.map_T_lidar for update in frames)
         if trajectory is not None:
             if not np.array_equal(trajectory.stamps, stamps):
                 raise InputError(f"{name}: expected the stamps of the run's poses, got others")

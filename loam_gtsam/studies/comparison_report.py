@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -339,7 +339,7 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
     if aligned and truth is not None:
         stamps = np.concatenate([trajectory.stamps for trajectory in aligned.values()])
         inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())
-        truth = replace(truth, stamps=truth.stamps[inside], map_T_lidar=truth.map_T_lidar[inside])
+        truth = truth[inside]
     if aligned:
         plots.plot_trajectories(path("trajectories.png"), aligned, truth)
     if errors and truth is not None:

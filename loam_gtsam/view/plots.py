@@ -72,7 +72,7 @@ def plot_trajectory(
     """
     lines = [] if truth is None else [("truth", truth, (TRUTH, "-"), 3.0)]
     figure, top = _trajectory_figure([*lines, ("estimate", trajectory, (PATH, "-"), 1.4)])
-    start = trajectory.map_T_lidar[:1, :3, 3]
+    start = trajectory.positions[:1]
     top.plot(start[:, 0], start[:, 1], "o", color=INK, ms=6, label="start")
     if loops is not None:
         for name, on, style in (("loops", loops[1], "-o"), ("loops, not used", ~loops[1], ":o")):

@@ -328,12 +328,6 @@ def test_right_covariances_have_a_nees_of_one(window: int) -> None:
     assert np.count_nonzero(values > worlds.FIVE_SIGMA) == 0
 
 
-def test_what_is_no_covariance_is_counted() -> None:
-    updates, true = random_walk(np.random.default_rng(0), 3)
-    updates[2] = replace(updates[2], covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]))
-    assert list(worlds.squared_errors(updates, true, worlds.START).values())[1] is None
-
-
 def test_growth_is_the_last_tenth_over_the_second_on_a_machine_of_any_pace() -> None:
     def judged(cpu: FloatArray, make: FloatArray) -> bool | None:
         columns = {name: np.arange(len(cpu), dtype=np.float64) for name in growth.COLUMNS}

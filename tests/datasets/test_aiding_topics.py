@@ -79,7 +79,7 @@ def test_a_run_with_gnss_places_its_map_on_the_earth(tmp_path):
         recording.append(("/points", scan.stamp, message))
     stamps = world.truth.stamps[2:-1]
     noise = np.random.default_rng(0).normal(0.0, 0.01, (len(stamps), 3))
-    positions = world.truth_at(stamps).map_T_lidar[:, :3, 3] + noise
+    positions = world.truth_at(stamps).positions + noise
     for stamp, enu in zip(stamps, positions, strict=True):
         place = geodetic_of((enu @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])[None], ORIGIN)[0]
         known = (1e-4, 1e-4, 1e-4)

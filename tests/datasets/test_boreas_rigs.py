@@ -38,7 +38,7 @@ def write_boreas(root: Path, **world: object) -> Path:
     turns = [Rotation.from_rotvec(-a * axis) for a, axis in zip(angles[0], (x, y, z), strict=True)]
     np.testing.assert_allclose((turns[0] * turns[1] * turns[2]).as_matrix(), one, atol=1e-12)
     rest = np.zeros((len(angles), 3))
-    rows = np.hstack([truth.map_T_lidar[:, :3, 3], rest, angles, rest])
+    rows = np.hstack([truth.positions, rest, angles, rest])
     header = "GPSTime,easting,northing,altitude,ve,vn,vu,roll,pitch,heading,wz,wy,wx"
     write.write_rows(root / "applanix" / "lidar_poses.csv", truth.stamps // 1000, rows, ",", header)
     return root
@@ -147,7 +147,7 @@ def test_ntu_viral_brings_the_positions_of_its_prism(tmp_path: Path) -> None:
     exact = write.lidar_truth()
     # Prism and lidar in the frame of the IMU, by the calibration files of the data set.
     prism = np.array([-0.293656, -0.012288, -0.273095]) - np.array([-0.05, 0.0, 0.055])
-    places = exact.map_T_lidar[:, :3, :3] @ prism + exact.map_T_lidar[:, :3, 3]
+    places = exact.map_T_lidar[:, :3, :3] @ prism + exact.positions
     store = store_of("ros1")
     entries = []
     for stamp, place in zip(exact.stamps.tolist(), places, strict=True):

@@ -91,7 +91,7 @@ def test_poses_are_moved_by_a_rigid_transform_only(world, matrix):
 def positions(tmp_path):
     file = tmp_path / "gps.txt"
     lines = [f"{s * 1e-9:.9f} {p[0]:.9f} {p[1]:.9f} {p[2]:.9f}" for s, p in
-             zip(TRUTH.stamps, TRUTH.map_T_lidar[:, :3, 3], strict=True)]  # fmt: skip
+             zip(TRUTH.stamps, TRUTH.positions, strict=True)]  # fmt: skip
     file.write_text("\n".join(lines))
     return file
 
@@ -191,7 +191,7 @@ def test_a_data_set_with_truth_is_judged_by_it(world, tmp_path):
     assert len(given) == len(world)
     assert given.name == world.name
     raised = (truth.map_T_lidar @ [0.0, 0.0, 1.0, 1.0])[:, :3]
-    np.testing.assert_allclose(given.truth.map_T_lidar[:, :3, 3], raised, atol=1e-8)
+    np.testing.assert_allclose(given.truth.positions, raised, atol=1e-8)
     assert "mine.tum" in given.info().facts["reference poses"]
     direct = world.with_truth(truth)
     np.testing.assert_array_equal(direct.truth.map_T_lidar, truth.map_T_lidar)

@@ -23,7 +23,7 @@ DOWN = np.array([0.0, 0.0, -9.81])
 FRAME = 100_000_000
 NOW = START + 500_000_000
 SECONDS = np.linspace(-0.15, 0.06, 41)
-RATE, TURN = np.array([0.3, -0.2, 0.9]), np.array([0.5, 1.0, -0.8])
+RATE = np.array([0.3, -0.2, 0.9])
 
 
 def level_of(down, felt=False):

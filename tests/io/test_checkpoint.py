@@ -78,7 +78,6 @@ def held_near_the_start(context):
 
 LOOPS = QUICK.changed("loops.enabled=true", "loops.min_way=3", "pose_graph.keyframe_distance=0.7")
 IMU = Config().changed("imu.lag=5")
-SCANS = Config().changed("odometry.method=scan_to_scan")
 DENSE = QUICK.changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
     "plain": ("street_loop?frames=8&columns=300", Config(), [1, 2, 5]),

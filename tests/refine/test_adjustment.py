@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.jacobians import numerical
+from support.trajectories import off_by
 
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
 from loam_gtsam.factors import checked_factor
@@ -73,11 +74,6 @@ def _scene(sweeps=6, count=900, noise=0.01, off=0.01, seed=0, extra=None, edges=
     return tuple(found), np.array([pose.matrix() for pose in poses]), np.array(wrong)
 
 
-def _errors(poses, truth):
-    relative = [np.linalg.inv(p[0]) @ p for p in (poses, truth)]
-    return np.linalg.norm(relative[0][:, :3, 3] - relative[1][:, :3, 3], axis=1)
-
-
 def _squared(result, truth):
     """Squared Mahalanobis distances over the freedoms of the motions from the first sweep."""
     squared, poses = [], [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
@@ -131,7 +127,7 @@ def test_poses_and_walls_are_found_and_as_well_as_they_are_told_to_be() -> None:
     for seed in range(4):
         sweeps, truth, wrong = _scene(seed=seed)
         result = refine(sweeps, wrong)
-        assert _errors(result.path.map_T_middle, truth).max() < 0.3 * _errors(wrong, truth).max()
+        assert off_by(result.path.map_T_middle, truth).max() < 0.3 * off_by(wrong, truth).max()
         squared += _squared(result, truth)
     assert 0.5 < np.mean(squared) < 2.0
     offsets = np.abs(result.landmarks.axes[:, :, 0]).max(axis=1)
@@ -150,7 +146,7 @@ def test_posts_fix_what_the_floor_leaves_open_and_as_well_as_they_are_told_to() 
         floor = [on_floor(*one) for one in zip(sweeps, truth, strict=True)]
         result = refine(floor, wrong)
         assert result.rounds[-1].lines >= len(POSTS)
-        assert _errors(result.path.map_T_middle, truth).max() < 0.5 * _errors(wrong, truth).max()
+        assert off_by(result.path.map_T_middle, truth).max() < 0.5 * off_by(wrong, truth).max()
         squared += _squared(result, truth)
         lines, told = result.landmarks.is_line, result.landmark_covariances()
         first = result.path.map_T_middle[0] @ np.linalg.inv(truth[0])
@@ -215,8 +211,8 @@ def test_something_that_moves_is_no_line() -> None:
 
     number = iter(range(6))
     sweeps, truth, wrong = _scene(edges=with_pedestrian)
-    still = _errors(refine(_scene(edges=_posts)[0], wrong).path.map_T_middle, truth).max()
-    moving = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    still = off_by(refine(_scene(edges=_posts)[0], wrong).path.map_T_middle, truth).max()
+    moving = off_by(refine(sweeps, wrong).path.map_T_middle, truth).max()
     assert moving < still + 0.001
 
 
@@ -257,8 +253,8 @@ def test_something_that_moves_does_not_bend_the_map() -> None:
     sweeps, truth, wrong = _scene(extra=car)
     without = _scene()
     assert np.array_equal(without[2], wrong)
-    still = _errors(refine(without[0], wrong).path.map_T_middle, truth).max()
-    moving = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    still = off_by(refine(without[0], wrong).path.map_T_middle, truth).max()
+    moving = off_by(refine(sweeps, wrong).path.map_T_middle, truth).max()
     assert moving < still + 0.002
 
 
@@ -270,8 +266,8 @@ def test_a_wrong_loop_does_not_bend_the_map_and_a_position_holds_it() -> None:
     far = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
     keys = gtsam.symbol("x", 0), gtsam.symbol("x", 5)
     factors.add(gtsam.BetweenFactorPose3(*keys, far, noise))
-    straight = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
-    bent = _errors(refine(sweeps, wrong, factors).path.map_T_middle, truth).max()
+    straight = off_by(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    bent = off_by(refine(sweeps, wrong, factors).path.map_T_middle, truth).max()
     assert bent < straight + 0.001
     held = gtsam.NonlinearFactorGraph()
     there = gtsam.Pose3(gtsam.Rot3(), np.array([100.0, 0.0, 0.0]))

@@ -42,7 +42,7 @@ class Surveyed:
     def off(self, found: RefinedRun) -> FloatArray:
         """(N, 3) metres east, north and up from where the lidar was."""
         way = found.trajectory
-        return off_in_enu(self.world.truth, way.stamps, way.map_T_lidar[:, :3, 3], found.earth)
+        return off_in_enu(self.world.truth, way.stamps, way.positions, found.earth)
 
 
 def survey_of(graph, earth: GeoReference | None, up: FloatArray | None = None) -> Survey:

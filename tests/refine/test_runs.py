@@ -47,7 +47,7 @@ class Two:
         began = self.ways[0].map_T_lidar[0]
         map_T_world = began @ np.linalg.inv(self.truth.map_T_lidar[0])
         true = [map_T_world @ self.truth.at(way.stamps).map_T_lidar for way in ways]
-        return [way.map_T_lidar[:, :3, 3] - poses[:, :3, 3]
+        return [way.positions - poses[:, :3, 3]
                 for way, poses in zip(ways, true, strict=True)]  # fmt: skip
 
 

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.jacobians import numerical
+from support.trajectories import off_by
 
 from loam_gtsam.refine.adjustment import refine
 from loam_gtsam.refine.elimination import LandmarkTies
@@ -57,11 +58,6 @@ def _odometry(truth, sigma=0.02):
     return graph
 
 
-def _errors(poses, truth):
-    relative = [np.linalg.inv(p[0]) @ p for p in (poses, truth)]
-    return np.linalg.norm(relative[0][:, :3, 3] - relative[1][:, :3, 3], axis=1)
-
-
 def _steps(poses, truth, span=5):
     """Errors of the motions over some sweeps, metres."""
     motions = [np.linalg.inv(p[:-span]) @ p[span:] for p in (poses, truth)]
@@ -104,7 +100,7 @@ def test_what_a_window_tells_is_a_quadratic_form_about_its_poses() -> None:
 def test_windows_find_what_an_adjustment_of_all_at_once_finds(street) -> None:
     sweeps, truth, wrong, windows = street
     whole = refine(sweeps, wrong, settings=Settings(whole=SWEEPS))
-    off = [_errors(found.path.map_T_middle, truth) for found in (whole, windows)]
+    off = [off_by(found.path.map_T_middle, truth) for found in (whole, windows)]
     steps = [_steps(poses, truth) for poses in (wrong, windows.path.map_T_middle)]
     assert np.median(steps[1]) < 0.2 * np.median(steps[0])
     assert min(found.rounds[-1].lines for found in (whole, windows)) > 10  # of 16 posts
@@ -136,7 +132,7 @@ def test_sweeps_without_planes_stay_where_the_odometry_has_them() -> None:
     with pytest.raises(InputError, match="no plane"):
         refine(thin, wrong, settings=Settings(whole=20))
     found = refine(thin, wrong, _odometry(truth), Settings(whole=20))
-    assert _errors(found.path.map_T_middle, truth)[:14].max() < 0.01
+    assert off_by(found.path.map_T_middle, truth)[:14].max() < 0.01
     assert _steps(found.path.map_T_middle, truth, span=1)[14:49].max() < 0.01
 
 
@@ -152,4 +148,4 @@ def test_a_wrong_loop_does_not_bend_windows_and_a_position_holds_them() -> None:
     factors.add(gtsam.PriorFactorPose3(keys[1], there, unit))
     found = refine(sweeps, wrong, factors, Settings(whole=20)).path.map_T_middle
     assert np.allclose(found[57, :3, 3], [100.0, 0.0, 0.0], atol=0.01)
-    assert _errors(found, truth).max() < 0.02
+    assert off_by(found, truth).max() < 0.02

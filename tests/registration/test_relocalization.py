@@ -105,7 +105,7 @@ def ended(begun, dataset):
 
 
 def errors(result, dataset):
-    away = result.trajectory.map_T_lidar[:, :3, 3] - dataset.truth.map_T_lidar[:, :3, 3]
+    away = result.trajectory.positions - dataset.truth.positions
     return np.linalg.norm(away, axis=1)
 
 

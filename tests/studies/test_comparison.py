@@ -191,7 +191,7 @@ def test_relative_errors_of_all_are_over_the_same_lengths():
         return SolverRun(name, "1", None, updates, 0)
 
     truth = winding(20)
-    part = Trajectory(truth.stamps[:15], truth.map_T_lidar[:15])
+    part = truth[:15]
     long, short = solver_run("long", truth), solver_run("short", part)
     assert (score(long, truth).lengths[0], score(short, truth).lengths[0]) == (1.0, 0.5)
     both = score_all(Comparison("x", (long, short), truth))

@@ -35,8 +35,8 @@ def motion(times):
     return Rotation.from_euler("ZYX", np.stack([yaw + 2.5, pitch, roll], 1)), np.stack(rates, 1)
 
 
-def moving(seconds=4.0, *, rate=200.0, orientation=True):
-    times = np.arange(round(seconds * rate)) / rate
+def moving(seconds=4.0, *, orientation=True):
+    times = np.arange(round(200 * seconds)) / 200.0
     world_R_lidar, gyro = motion(times)
     return ImuSamples(
         stamps=ns(times),

@@ -34,8 +34,8 @@ def solved(
     ), step  # fmt: skip
 
 
-def surroundings(rng, count=1500, axes=3):
+def surroundings(rng, axes=3):
     """Points on walls along ``axes`` of the map, as seen from the pose, and their normals."""
-    normals = np.eye(3)[rng.integers(0, axes, count) + 3 - axes]
-    there = rng.uniform(-15.0, 15.0, (count, 3)) + POSE.translation()
+    normals = np.eye(3)[rng.integers(0, axes, 1500) + 3 - axes]
+    there = rng.uniform(-15.0, 15.0, (1500, 3)) + POSE.translation()
     return POSE.transformTo(there.T).T, normals, there

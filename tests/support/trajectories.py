@@ -8,14 +8,20 @@ from loam_gtsam.types import Trajectory
 STAMP = 1_700_000_000_000_000_000
 
 
-def winding(count=120, seed=0, step=1.0):
+def winding(count=120, step=1.0):
     """A path of even steps that turns about all axes."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     poses, at = [], gtsam.Pose3()
     for _ in range(count):
         poses.append(at.matrix())
         at = at.compose(gtsam.Pose3.Expmap(np.r_[rng.normal(0, 0.05, 3), step, 0.0, 0.0]))
     return Trajectory(STAMP + np.arange(count) * 100_000_000, np.array(poses))
+
+
+def off_by(poses, truth):
+    """Metres by which (N, 4, 4) poses are off, both seen from their first."""
+    found, right = (np.linalg.inv(p[0]) @ p for p in (poses, truth))
+    return np.linalg.norm(found[:, :3, 3] - right[:, :3, 3], axis=1)
 
 
 def disturbed(trajectory, seed=1, size=0.02):

@@ -53,7 +53,7 @@ def recorded(world: SimulatedWorld, kind: str) -> Recording:
     rows = np.hstack([world.imu.orientation, world.imu.gyro, world.imu.acceleration])
     for stamp, row in zip(world.imu.stamps.tolist(), rows, strict=True):
         recording.append(("/imu", stamp, imu(store, stamp, row)))
-    places = world.truth.map_T_lidar[:, :3, 3]
+    places = world.truth.positions
     for stamp, place, (latitude, longitude, height) in zip(
         world.truth.stamps.tolist(), places, geodetic_of(places, ORIGIN), strict=True
     ):

@@ -14,9 +14,9 @@ MAP = MapConfig(field_of_view=False)
 NONE = np.empty((0, 3))
 
 
-def face(y: float, step: float = 0.4, first: float = -3.0) -> FloatArray:
+def face(y: float) -> FloatArray:
     """Points on the wall at this y, on a grid."""
-    x, z = np.meshgrid(np.arange(first, 3.0 + 1e-9, step), np.arange(-1.8, 1.81, step))
+    x, z = np.meshgrid(np.arange(-3.0, 3.0 + 1e-9, 0.4), np.arange(-1.8, 1.81, 0.4))
     return np.column_stack([x.ravel(), np.full(x.size, y), z.ravel()])
 
 

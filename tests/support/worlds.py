@@ -33,17 +33,17 @@ def room_features(map_T_lidar, stamp, rng, count=6000, noise=0.0):
 class World:
     """Points of walls, posts and the ground, seen without occlusion up to 20 m."""
 
-    def __init__(self, seed, walls=40, posts=80, low=-25.0, high=65.0):
+    def __init__(self, seed, walls=40, posts=80):
         rng = np.random.default_rng(seed)
-        x, y = (line.ravel() for line in np.meshgrid(*[np.arange(low, high, 0.5)] * 2))
+        x, y = (line.ravel() for line in np.meshgrid(*[np.arange(-25.0, 65.0, 0.5)] * 2))
         planes = [np.column_stack([x, y, np.full(len(x), -1.7)])]
         for _ in range(walls):
             along, up = (line.ravel() for line in np.meshgrid(np.arange(0, 8, 0.5),
                                                               np.arange(-1.5, 4, 0.5)))  # fmt: skip
-            turn, foot = rng.uniform(0, np.pi), rng.uniform(low, high, 2)
+            turn, foot = rng.uniform(0, np.pi), rng.uniform(-25.0, 65.0, 2)
             planes.append(np.column_stack([foot[0] + along * np.cos(turn),
                                            foot[1] + along * np.sin(turn), up]))  # fmt: skip
-        feet = rng.uniform(low, high, (posts, 2))
+        feet = rng.uniform(-25.0, 65.0, (posts, 2))
         heights = np.arange(-1.6, 3.0, 0.25)
         self.planes = np.concatenate(planes)
         self.edges = np.column_stack([np.repeat(feet, len(heights), axis=0),

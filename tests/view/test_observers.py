@@ -156,7 +156,7 @@ def test_the_map_and_the_way_are_those_of_the_run(watched):
     last = kept.maps[-1]
     np.testing.assert_array_equal(last.edges, outcome.edge_points)
     np.testing.assert_array_equal(last.planes, outcome.plane_points)
-    np.testing.assert_array_equal(last.path, outcome.trajectory.map_T_lidar[:, :3, 3])
+    np.testing.assert_array_equal(last.path, outcome.trajectory.positions)
     assert last.loops.shape == (0, 2, 3)
     assert [len(view.path) for view in kept.maps] == list(range(1, FRAMES + 1))
 

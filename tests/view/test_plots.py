@@ -105,7 +105,7 @@ def test_errors_are_drawn_over_time(tmp_path):
 
 
 def test_loops_are_drawn_in_the_last_panel_only(tmp_path):
-    way = circle().map_T_lidar[:, :3, 3]
+    way = circle().positions
     panels = {"before": (way, way), "after": (way, way)}
     loops = np.array([[[-15.0, -15.0, 0.0], [15.0, 15.0, 0.0]]])
     for name, drawn in (("with.png", loops), ("without.png", loops[:0])):
@@ -154,7 +154,7 @@ def test_a_direction_that_is_not_seen_hides_nothing(tmp_path):
 def test_a_map_of_a_room_has_no_ceiling_and_one_of_a_street_has_its_walls():
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-4, 4, (4000, 2)), np.full(4000, -1.0)])
-    roof, way = np.add(floor, [0.0, 0.0, 3.0]), circle().map_T_lidar[:, :3, 3] * 0.1
+    roof, way = np.add(floor, [0.0, 0.0, 3.0]), circle().positions * 0.1
     far = roof[np.linalg.norm(roof[:, :2], axis=1) > 3.6]  # as with beams that rise little
     for high in (roof, far):
         points = np.concatenate([floor, high])

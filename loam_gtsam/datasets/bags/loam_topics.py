@@ -31,7 +31,6 @@ class LoamTopicsDataset(Loader):
         ``/laser_odom_to_init`` and, optionally, ``/velodyne_cloud_3`` and ``/aft_mapped_to_init``
     axes : ``lidar`` (A-LOAM), ``loam`` (the original's camera-like axes), or ``auto``: the
         directions of a spinning lidar's points spread least along its vertical axis
-
     imu_topic : whose roll and pitch the mapping uses, as laserMapping does; the one with the most
         messages if None, if there is any
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.geometry import as_array, inverse_pose
+from loam_gtsam.geometry import as_array, inverse_pose, is_rigid
 from loam_gtsam.types import FloatArray, InputError, Trajectory
 
 
@@ -39,13 +39,6 @@ def rigid_transform(rotation: Rotation, translation: Sequence[float] | FloatArra
     matrix[:3, :3] = rotation.as_matrix()
     matrix[:3, 3] = translation
     return matrix
-
-
-def is_rigid(matrix: FloatArray) -> bool:
-    """Whether a (4, 4) matrix is a rigid transform, up to what writing it has rounded."""
-    rotation = matrix[:3, :3]
-    proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    return bool(proper and np.linalg.det(rotation) > 0.0 and (matrix[3] == [0, 0, 0, 1]).all())
 
 
 def moved_to_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:

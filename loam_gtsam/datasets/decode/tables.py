@@ -12,6 +12,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
+from loam_gtsam.geometry import is_rigid
 from loam_gtsam.types import (
     MAX_STAMP,
     DatasetError,
@@ -29,8 +30,6 @@ UNIT_TOLERANCE = 0.1
 """Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
 _WHOLE = re.compile(r"[+-]?[0-9]+")
-_ROUNDED = 1e-2
-"""Digits that are missing in the rotations of files."""
 _SLOW = 2.0  # seconds from a sweep to the next, above which the unit of the stamps is doubted
 _HUGE = 1e100  # its square is finite
 _LONGEST = 40  # characters of a number: of any stamp, with zeros before it
@@ -141,13 +140,10 @@ def pose_matrix(numbers: Sequence[float]) -> FloatArray:
 
 def rigid_matrix(numbers: Sequence[float]) -> FloatArray:
     """(4, 4) transform of the 12 numbers of its first three rows; ValueError if it is not rigid."""
-    rows = np.reshape(_finite(numbers), (3, 4))
-    rotation = rows[:, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROUNDED)
-        if not (proper and np.linalg.det(rotation) > 0.0):
-            raise ValueError("no rigid transform")
-    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
+    matrix = np.vstack([np.reshape(_finite(numbers), (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    if not is_rigid(matrix):
+        raise ValueError("no rigid transform")
+    return matrix
 
 
 def _finite(numbers: Sequence[float]) -> Sequence[float]:

@@ -13,6 +13,7 @@ from loam_gtsam.datasets.decode.packed_points import XYZI, read_records
 from loam_gtsam.datasets.decode.tables import read_table, sorted_trajectory
 from loam_gtsam.datasets.known.layouts import MULRAN_FOLDERS, first_existing
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
+from loam_gtsam.geometry import is_rigid
 from loam_gtsam.types import DatasetError, Trajectory
 
 RIG = Rig(
@@ -84,8 +85,7 @@ class MulRanDataset(StampedFiles):
         stamps, values = read_table(path, names, ",")
         poses = np.tile(np.eye(4), (len(stamps), 1, 1))
         poses[:, :3] = values.reshape(-1, 3, 4)
-        error = poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
-        bad = np.flatnonzero((np.abs(error) > 1e-3).any(axis=(1, 2)))
+        bad = np.flatnonzero(~is_rigid(poses))
         if len(bad):
             raise DatasetError(f"{path}: row {bad[0] + 1} does not hold a rotation matrix")
         return sorted_trajectory(stamps, poses, path.name, self._problems)

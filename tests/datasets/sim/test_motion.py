@@ -40,7 +40,7 @@ def test_a_moving_start_is_the_same_drive_three_and_a_half_seconds_later(scene):
 @pytest.mark.parametrize("scene", SCENES)
 def test_every_scene_can_start_at_full_speed(scene):
     world = SimulatedWorld(scene, start="moving", **PERFECT_IMU)
-    positions = world.truth.map_T_lidar[:, :3, 3]
+    positions = world.truth.positions
     first = np.linalg.norm(positions[1] - positions[0]) * 10.0
     assert 0.65 * world.scene.speed < first < 1.5 * world.scene.speed
     # What the IMU says from before the first sweep on: truth itself, turned and moved.
@@ -168,7 +168,7 @@ def test_stairs_are_walked_at_the_height_of_a_head(seed):
 def test_the_rooms_are_145_metres_round_and_both_faces_of_a_wall_are_seen():
     for seed in (0, 3):
         world = SimulatedWorld("rooms", seed=seed, frames=1400, columns=90)
-        way = world.truth.map_T_lidar[:, :3, 3]
+        way = world.truth.positions
         home = 1000 + np.linalg.norm(way[1000:], axis=1).argmin()
         metres = np.linalg.norm(np.diff(way[:home], axis=0), axis=1).sum()
         assert metres == pytest.approx(145.0, abs=8.0)
@@ -180,7 +180,7 @@ def test_the_rooms_are_145_metres_round_and_both_faces_of_a_wall_are_seen():
 @pytest.mark.parametrize("scene", ["street_loop", "avenue", "single_pole"])
 def test_a_start_can_be_as_fast_as_asked(scene, speed):
     world = SimulatedWorld(scene, speed=speed, start="moving", frames=10, columns=60)
-    steps = np.diff(world.truth.map_T_lidar[:, :3, 3], axis=0)
+    steps = np.diff(world.truth.positions, axis=0)
     first = np.linalg.norm(steps[0]) * 10.0
     # Bends slow it down: the pole's way is one of 6 m radius.
     most = np.sqrt(2.5 * 6.0) * 1.6 if scene == "single_pole" else 1.15 * speed

@@ -45,7 +45,6 @@ from loam_gtsam.registration.solvers.own_factors import (
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.start import Start
 from loam_gtsam.registration.uncertainty import PoseErrors
-from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
 from loam_gtsam.types import (
     ConfigError,
     Features,
@@ -122,7 +121,6 @@ class Mapper:
         self.registered: Registered | None = None
         self.monitor, self.errors = FitMonitor(self.config.relocalization), PoseErrors(self.config)
         self._stamps, self.point_times = StampCheck(), PointTimes(self.config)
-        self.beam_errors = BeamErrors(self.config)
         self.start: Start | None = None
         self._moment: Moment | None = None
         self._next: NextPiece | None = None
@@ -292,7 +290,6 @@ class Mapper:
             self.errors.jumped(*step, unlike=unlike, searched=found.searched)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
-            self.beam_errors.add(posed.sweep, solution, scan)
         status, message = status_of(solution, found.message or self.point_times.problem or said)
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last

@@ -114,7 +114,7 @@ class Results:
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
         if self.run.pipeline is not None:
             save_map(folder / MAP_FILE, self.run.pipeline)
-            files += _write_beams(folder / BEAMS_FILE, self.run.pipeline.mapper.beam_errors)
+            files += _write_beams(folder / BEAMS_FILE, self.run.pipeline.mapper.errors.beam_errors)
         if self.run.fixes is not None and self.run.fixes.reference is not None:
             write_enu(folder / ENU_FILE, self.run.trajectory, self.run.fixes.reference)
             files.append(ENU_FILE)

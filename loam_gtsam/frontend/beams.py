@@ -49,6 +49,11 @@ def elevations_of(xyz: NDArray[np.float32], ring_starts: IntArray) -> FloatArray
     return means
 
 
+def half_way(elevations: FloatArray) -> float:
+    """Half of the usual step between beams at (R,) elevations; no limit for a single one."""
+    return 0.5 * float(np.median(np.diff(np.sort(elevations)))) if len(elevations) > 1 else np.inf
+
+
 def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> OrganisedSweep:
     """The sweep without the errors of its beams; a ring that is none of ``beams`` stays as it is.
 
@@ -71,8 +76,7 @@ def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> Orga
     elevations = np.degrees(elevations_of(sweep.xyz, sweep.ring_starts))
     away = np.abs(elevations[:, None] - table[:, 0])
     nearest = away.argmin(axis=1)
-    apart = np.diff(table[:, 0]).min() if len(table) > 1 else 1.0
-    errors = np.where((away.min(axis=1) <= 0.5 * apart)[:, None], table[nearest, 1:], 0.0)
+    errors = np.where((away.min(axis=1) <= half_way(table[:, 0]))[:, None], table[nearest, 1:], 0.0)
     errors[:, 1:] = np.radians(errors[:, 1:])
     each = np.repeat(errors, np.diff(sweep.ring_starts), axis=0)
     return replace(sweep, xyz=moved(sweep.xyz.T, -each).T.astype(np.float32))

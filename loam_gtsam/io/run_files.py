@@ -244,7 +244,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "localizability": _axes_part(result),
         "point_times": result.times_problem or None,
         "ranges": None if result.range_offset is None else result.range_offset.as_dict(),
-        "beams": result.pipeline and result.pipeline.mapper.beam_errors.as_dict(),
+        "beams": result.pipeline and result.pipeline.mapper.errors.beam_errors.as_dict(),
         "imu": None if result.imu is None else _imu_part(result.imu),
         "loops": None if result.loops is None else result.loops.counts(),
         "gnss": None if result.fixes is None else result.fixes.as_dict(),

@@ -66,7 +66,7 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
     if result.range_offset is not None and result.range_offset.problem:
         notes.append(result.range_offset.problem)
-    if result.pipeline is not None and (said := result.pipeline.mapper.beam_errors.problem):
+    if result.pipeline is not None and (said := result.pipeline.mapper.errors.beam_errors.problem):
         notes.append(said)
     few = result.config.solver.method == "aloam"  # associations, by its design
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT), few))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from loam_gtsam.config import Config
-from loam_gtsam.frontend.beams import BeamRow, Rays
+from loam_gtsam.frontend.beams import BeamRow, Rays, half_way
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
@@ -24,8 +24,9 @@ _KINDS = "ranges", "elevations", "azimuths"
 _EXPECTED = np.array([0.02, np.radians(0.05), np.radians(0.05)])
 """Metres and rad: standard deviations of the errors before any sweep has told. Data sheets promise
 2 to 3 cm, and 0.1 degrees or less."""
-_MOVED, _TURNED = 0.5, np.radians(10.0)
-"""Metres and rad from one sweep that counts to the next: what is nearer meets the same points."""
+_MOVED, _TURNED, _LATER = 0.5, np.radians(10.0), 300_000_000
+"""From one sweep that counts to the next: metres or rad, for what is nearer meets the same points,
+and nanoseconds, for it takes a millisecond or more."""
 _SWEEPS = 10
 """Sweeps that are foretold before a word is said."""
 _FREEDOMS = 6.0
@@ -52,7 +53,7 @@ class BeamErrors:
         self._elevations = np.zeros(0)  # (B,) rad, ascending
         self._information, self._pull = np.zeros((0, 0)), np.zeros(0)  # (3 B, 3 B) and (3 B,)
         self._errors = np.zeros(0)  # (3 B,) of each beam in turn
-        self._at: gtsam.Pose3 | None = None
+        self._last: tuple[int, gtsam.Pose3] | None = None  # nanoseconds and pose of its middle
         self._count = 0
         self._sums, self._squares = np.zeros(3), np.zeros(3)  # of what was explained, by kind
         self._left = 0.0  # of squared residuals, in the sweeps that were foretold
@@ -62,14 +63,10 @@ class BeamErrors:
         pose, elevations = solution.map_T_lidar, sweep.ring_elevations
         if scan is None or solution.weak is not None or elevations is None or len(elevations) < 2:
             return
-        if self._at is not None:
-            step = self._at.localCoordinates(pose)
-            if np.linalg.norm(step[3:]) < _MOVED and np.linalg.norm(step[:3]) < _TURNED:
-                return
         matches = solution.matches
-        if len(matches.planes) == 0:
+        if len(matches.planes) == 0 or not self._is_new(sweep.stamp, pose):
             return
-        self._at = pose
+        self._last = sweep.stamp, pose
         self._meet(elevations)
         rows = match_rows(matches, self._solver.kernel_width, self._solver.kernel)
         planes = slice(2 * len(matches.edges), None)
@@ -90,9 +87,17 @@ class BeamErrors:
         self._pull = self._pull + counts * pull
         self._errors = self._solved()
 
+    def _is_new(self, stamp: int, pose: gtsam.Pose3) -> bool:
+        """Whether a sweep meets other points than the last one that counted."""
+        if self._last is None:
+            return True
+        step = self._last[1].localCoordinates(pose)
+        away = np.linalg.norm(step[3:]) >= _MOVED or np.linalg.norm(step[:3]) >= _TURNED
+        return bool(away) and stamp - self._last[0] >= _LATER
+
     def _meet(self, elevations: FloatArray) -> None:
         """Take in beams at these elevations (R,), rad, that are none of those known."""
-        known, apart = self._elevations, 0.5 * float(np.diff(np.sort(elevations)).min())
+        known, apart = self._elevations, half_way(elevations)
         new = elevations
         if len(known):
             new = elevations[np.abs(elevations[:, None] - known).min(axis=1) > apart]

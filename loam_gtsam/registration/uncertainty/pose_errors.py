@@ -22,6 +22,7 @@ from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
+from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
 from loam_gtsam.registration.uncertainty.map_error import MapError
 from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
@@ -84,7 +85,12 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
 class PoseErrors:
     """Calibrates the covariances of a run, frame by frame.
 
-    Of ``config``, ``covariance``, ``solver``, ``deskew.model`` and parts of ``imu`` are used.
+    Of ``config``, ``covariance``, ``solver``, ``deskew.model``, ``sensor.beams`` and parts of
+    ``imu`` are used.
+
+    Attributes
+    ----------
+    beam_errors : by how much the points of each beam look off
     """
 
     def __init__(self, config: Config) -> None:
@@ -98,6 +104,7 @@ class PoseErrors:
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
+        self.beam_errors = BeamErrors(config)
         self._found: MapUpdate | None = None  # the last update of a sweep that was found
 
     @property
@@ -181,6 +188,8 @@ class PoseErrors:
         if self._scans == 1:
             self._map.set_origin(sweep, scan, middle, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)
+        if last is not None and doubt is None:
+            self.beam_errors.add(sweep, solution, scan)
         # A pose that own factors tell shares less of the map's error.
         from_map = own.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
         covariance = own.covariance + from_map @ self._map.doubt @ from_map.T

@@ -1,0 +1,79 @@
+"""Beams that disagree are found by what the matches leave; without their errors maps are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loam_gtsam import Config, RunResult, SimulatedWorld, run
+from loam_gtsam.datasets.sim.disturbances import Disturbance, Disturbed
+from loam_gtsam.frontend.beams import moved
+from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
+from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.types import FloatArray, Scan
+
+ALONE = Config().changed("imu.coupling=off")
+WORLD = SimulatedWorld("garage", frames=70, columns=450, seed=1, start="moving")
+KINDS = {"ranges": (0.015, 0.0, 0.0), "elevations": (0.0, 1.5e-3, 0.0), "none": (0.0, 0.0, 0.0)}
+
+
+def made(kind: str) -> FloatArray:
+    """(16, 3) errors of the beams, of each kind with the mean zero."""
+    errors = np.random.default_rng(8).normal(size=(16, 3))
+    return (errors - errors.mean(axis=0)) * KINDS[kind]
+
+
+class OfBeams(Disturbance):
+    """Every beam has errors of its own."""
+
+    def __init__(self, kind: str) -> None:
+        self._errors = made(kind)
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """See :meth:`Disturbance.apply`."""
+        assert scan.rings is not None
+        points = moved(scan.points, self._errors[scan.rings])
+        return replace(scan, points=np.where(np.isfinite(scan.points), points, np.nan))
+
+
+@cache
+def mapped(kind: str) -> RunResult:
+    return run(Disturbed(WORLD, [OfBeams(kind)]), ALONE)
+
+
+def errors_of(result: RunResult) -> BeamErrors:
+    assert result.pipeline is not None
+    return result.pipeline.mapper.errors.beam_errors
+
+
+def ate(result: RunResult) -> float:
+    return absolute_error(result.trajectory, WORLD.truth).rmse
+
+
+def test_beams_without_errors_are_not_spoken_of() -> None:
+    found = errors_of(mapped("none"))
+    assert found.believed == (False, False, False)
+    assert found.problem == ""
+    assert found.advised == ()
+    assert np.abs(found.explained).max() < 0.01
+
+
+@pytest.mark.parametrize(("number", "kind"), [(0, "ranges"), (1, "elevations")])
+def test_errors_of_beams_are_found_and_taken_out(number: int, kind: str) -> None:
+    wrong = mapped(kind)
+    found = errors_of(wrong)
+    assert found.believed[number]
+    assert kind in found.problem
+    assert any("the beams of the lidar disagree" in note for note in wrong.notes)
+    told = np.array(found.advised)[:, 1 + number]
+    told = told if number == 0 else np.radians(told)
+    assert (
+        np.corrcoef(told, made(kind)[:, number])[0, 1] > 0.5
+    )  # few matches tell of those above the horizon
+    right = run(Disturbed(WORLD, [OfBeams(kind)]), ALONE.changed({"sensor.beams": found.advised}))
+    left = errors_of(right).explained[number]
+    assert left < 0.4 * found.explained[number]  # the map has had a part of them
+    assert ate(right) < ate(wrong)

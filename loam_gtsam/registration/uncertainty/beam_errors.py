@@ -210,6 +210,6 @@ class BeamErrors:
         share = float(self.explained @ np.array(believed))
         return (
             f"the beams of the lidar disagree, {said} (root mean square), which explains "
-            f"{100.0 * share:.0f} % of what the matches leave: map with sensor.beams, "
-            "which a run writes to beams.yaml (--config)"
+            f"{100.0 * share:.0f} % of what the matches leave; poses are worse than told: map with "
+            "sensor.beams, which a run writes to beams.yaml (--config)"
         )

@@ -70,9 +70,8 @@ def test_errors_of_beams_are_found_and_taken_out(number: int, kind: str) -> None
     assert any("the beams of the lidar disagree" in note for note in wrong.notes)
     told = np.array(found.advised)[:, 1 + number]
     told = told if number == 0 else np.radians(told)
-    assert (
-        np.corrcoef(told, made(kind)[:, number])[0, 1] > 0.5
-    )  # few matches tell of those above the horizon
+    # Few matches tell of elevations above the horizon.
+    assert np.corrcoef(told, made(kind)[:, number])[0, 1] > 0.5
     right = run(Disturbed(WORLD, [OfBeams(kind)]), ALONE.changed({"sensor.beams": found.advised}))
     left = errors_of(right).explained[number]
     assert left < 0.4 * found.explained[number]  # the map has had a part of them

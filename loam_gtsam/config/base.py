@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, g
 
 import numpy as np
 from annotated_types import Ge, Le
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
@@ -44,6 +44,8 @@ Angle = Annotated[float, Ge(-360.0), Le(360.0)]
 """An entry of a tuple: degrees."""
 Offset = Annotated[float, Ge(-1000.0), Le(1000.0)]
 """An entry of a tuple: metres on one vehicle."""
+BeamRow = Annotated[tuple[Angle, Offset, Angle, Angle], Strict(False)]
+"""An entry of a tuple: errors of a beam, see ``sensor.beams``."""
 
 
 def parameter(
@@ -125,10 +127,11 @@ class Section(BaseModel):
         if kind == "literal_error":
             near = nearest(error["input"], choices, listing=False)
             return (key,), f"expected one of {', '.join(choices)}; got {given}{near}"
+        if Ellipsis in choices and kind in ("tuple_type", "missing", "too_long"):
+            entry = get_args(get_args(choices[0])[0])
+            return (key,), f"expected rows of {len(entry)} values, got {given}"
         if isinstance(field.default, tuple) and (len(error["loc"]) == 1 or kind == "missing"):
-            rows = Ellipsis in choices  # any number of them
-            count = len(get_args(choices[0]) if rows else choices)
-            return (key,), f"expected {'rows of ' if rows else ''}{count} values, got {given}"
+            return (key,), f"expected {len(choices)} values, got {given}"
         expected = _EXPECTED.get(kind, "a valid value").format(**error.get("ctx", {}))
         if kind == "bool_type" and isinstance(error["input"], str):
             expected = "true or false (other words, as yes, are text in YAML 1.2)"

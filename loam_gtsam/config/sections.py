@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from loam_gtsam.config.base import Angle, Count, Offset, Section, parameter
+from loam_gtsam.config.base import Angle, BeamRow, Count, Offset, Section, parameter
 
 
 class SensorConfig(Section):
@@ -42,7 +42,7 @@ class SensorConfig(Section):
     """All ranges are too long by this, and are made shorter. The end of a run says by how much they
     look too long: a driver may count them from another point of the lidar than its centre."""
 
-    beams: tuple[tuple[Angle, Offset, Angle, Angle], ...] = parameter(())
+    beams: tuple[BeamRow, ...] = parameter(())
     """Errors of single beams: of each its elevation (degrees), by how much its ranges are too long
     (m), and its elevations and azimuths too large (degrees). They are taken from its points. A run
     in which they show writes them to beams.yaml."""

@@ -9,12 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.config.base import BeamRow
 from loam_gtsam.frontend.organise import OrganisedSweep
 from loam_gtsam.types import FloatArray, IntArray, SweepError, SweepFault
-
-BeamRow = tuple[float, float, float, float]
-"""Elevation of a beam, degrees; its ranges are too long by this, metres; elevation and azimuth of
-its points are too large by this, degrees."""
 
 
 class Rays(NamedTuple):
@@ -57,7 +54,9 @@ def half_way(elevations: FloatArray) -> float:
 def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> OrganisedSweep:
     """The sweep without the errors of its beams; a ring that is none of ``beams`` stays as it is.
 
-    A ring is that of the beam with the nearest elevation, no farther than half way to the next.
+    A row has the elevation of a beam, degrees, by how much its ranges are too long, metres, and its
+    elevations and azimuths too large, degrees. It is for the ring with the nearest elevation, no
+    farther than half way to the next.
 
     Raises
     ------

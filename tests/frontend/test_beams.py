@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from loam_gtsam import Config, SimulatedWorld, extract_features
+from loam_gtsam.config import dump_config, load_config
 from loam_gtsam.frontend.beams import Rays, elevations_of, moved, without_beam_errors
 from loam_gtsam.frontend.organise import organise
 from loam_gtsam.types import ConfigError, FloatArray, Scan, SweepError
@@ -66,8 +69,15 @@ def test_beams_need_rings() -> None:
 
 @pytest.mark.parametrize("rows", ["[[1.0, 2.0]]", "[1.0]", "3", "[[0, 0, 0, 400]]"])
 def test_rows_of_beams_that_are_none_are_refused(rows: str) -> None:
-    with pytest.raises(ConfigError, match=r"sensor\.beams: expected"):
+    expected = "at most 360.0, got 400" if "400" in rows else "rows of 4 values, got"
+    with pytest.raises(ConfigError, match=rf"sensor\.beams: expected {expected}"):
         Config().changed(f"sensor.beams={rows}")
+
+
+def test_beams_go_through_a_file(tmp_path: Path) -> None:
+    config = Config().changed("sensor.beams=[[-15, 0.01, 0.02, -0.03], [1.0, 0, 0, 0]]")
+    (tmp_path / "config.yaml").write_text(dump_config(config))
+    assert load_config(tmp_path / "config.yaml") == config
 
 
 def test_rays_are_the_derivatives_of_points_by_errors() -> None:

@@ -13,7 +13,8 @@ import numpy as np
 from scipy import sparse
 
 from loam_gtsam.config import Config
-from loam_gtsam.frontend.beams import BeamRow, Rays, half_way
+from loam_gtsam.config.base import BeamRow
+from loam_gtsam.frontend.beams import Rays, half_way
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows

@@ -22,6 +22,7 @@ from support.quick import QUICK_START
 from loam_gtsam.cli import report
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
+from loam_gtsam.cli.refine import FinishedRun
 from loam_gtsam.cli.report import where_it_turns
 from loam_gtsam.cli.results import BASE_FILES, ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, load_config
@@ -614,6 +615,24 @@ def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones() -> None:
     assert report["range_offsets_m"] == [summary["ranges"]["advised_offset_m"]]
     assert report["range_offsets_m"][0] == pytest.approx(0.0, abs=0.007)
     assert report["after"]["ate_rmse_m"] < 0.5 * summary["accuracy"]["ate_rmse_m"]
+
+
+def test_a_run_whose_beams_disagree_writes_what_they_are_off_by() -> None:
+    spec = "sim:garage?frames=70&columns=450&seed=1&start=moving"
+    wrong = [
+        [float(2 * beam - 15), (0.015 if beam % 2 else -0.015), 0.0, 0.0] for beam in range(16)
+    ]
+    Path("wrong.yaml").write_text(json.dumps({"sensor": {"beams": wrong}}))
+    alone = "--config", "wrong.yaml", "--set", "imu.coupling=off"
+    done = loam("run", spec, "--output", "out", "--no-plot", *alone)
+    assert "the beams of the lidar disagree, ranges by 1" in done.output
+    found = load_config("out/beams.yaml").sensor.beams
+    ranges = np.array(found)[:, 1]
+    assert np.std(ranges) < 0.01  # of 15 mm
+    refined = FinishedRun.read(Path("out"), open_dataset(spec))
+    assert refined.config.sensor.beams == found
+    loam("run", spec, "--output", "out", "--overwrite", "--no-plot", "--set", "imu.coupling=off")
+    assert not Path("out/beams.yaml").exists()
 
 
 def test_a_run_is_refined_into_a_folder_of_its_own() -> None:

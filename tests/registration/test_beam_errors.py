@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam import Config, RunResult, SimulatedWorld, run
 from loam_gtsam.datasets.sim.disturbances import Disturbance, Disturbed
@@ -76,3 +77,20 @@ def test_errors_of_beams_are_found_and_taken_out(number: int, kind: str) -> None
     left = errors_of(right).explained[number]
     assert left < 0.4 * found.explained[number]  # the map has had a part of them
     assert ate(right) < ate(wrong)
+
+
+class Askew(Disturbance):
+    """The lidar is mounted askew, and another part of its view is hidden in each sweep."""
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """See :meth:`Disturbance.apply`."""
+        hidden = (np.arctan2(scan.points[:, 1], scan.points[:, 0]) + number) % (2.0 * np.pi) < 3.0
+        points = scan.points @ Rotation.from_euler("y", 12.0, degrees=True).as_matrix().T
+        return replace(scan, points=np.where(hidden[:, None], np.nan, points))
+
+
+def test_rings_whose_elevations_wander_are_not_those_of_beams() -> None:
+    dense = SimulatedWorld("garage", frames=40, columns=300, seed=1, sensor="os1-64")
+    found = errors_of(run(Disturbed(dense, [Askew()]), ALONE))
+    assert found.believed == (False, False, False)
+    assert len(found.as_dict()["advised"] or []) == 0

@@ -35,6 +35,8 @@ _FREEDOMS = 6.0
 its pose explain. What explains less moves a pose by less than its own standard deviation."""
 _ODD = 5.0
 """Standard deviations of the mean of what they explain, beyond which it is no chance."""
+_MORE = 1.5
+"""Times the rings of a sweep: if more elevations were met, these are not those of beams."""
 _TOGETHER = 1e3
 """Over the expected error: a beam's errors beside those of all, of which the map has as much."""
 
@@ -56,19 +58,24 @@ class BeamErrors:
         self._errors = np.zeros(0)  # (3 B,) of each beam in turn
         self._last: tuple[int, gtsam.Pose3] | None = None  # nanoseconds and pose of its middle
         self._count = 0
+        self._wander = False  # whether the elevations of rings are not those of beams
         self._sums, self._squares = np.zeros(3), np.zeros(3)  # of what was explained, by kind
         self._left = 0.0  # of squared residuals, in the sweeps that were foretold
 
     def add(self, sweep: MovingSweep, solution: Solution, scan: ScanError | None) -> None:
         """Take in a sweep whose pose all its matches together have fixed."""
         pose, elevations = solution.map_T_lidar, sweep.ring_elevations
-        if scan is None or solution.weak is not None or elevations is None or len(elevations) < 2:
+        if self._wander or scan is None or solution.weak is not None:
+            return
+        if elevations is None or len(elevations) < 2:
             return
         matches = solution.matches
         if len(matches.planes) == 0 or not self._is_new(sweep.stamp, pose):
             return
         self._last = sweep.stamp, pose
         self._meet(elevations)
+        if self._wander:
+            return
         rows = match_rows(matches, self._solver.kernel_width, self._solver.kernel)
         planes = slice(2 * len(matches.edges), None)
         residuals, by_pose = (part[planes] for part in rows.residuals(pose))
@@ -105,6 +112,9 @@ class BeamErrors:
         if not len(new):
             return
         joined = np.concatenate((known, new))
+        if len(joined) > _MORE * len(elevations):
+            self._wander, self._count = True, 0
+            return
         order = np.argsort(joined, kind="stable")
         place = np.argsort(order, kind="stable")[: len(known)]
         rows = (3 * place[:, None] + np.arange(3)).ravel()

@@ -66,7 +66,7 @@ class BagDataset(Loader):
         self.sensor: Mapping[str, Any] = {}
         self._options: pointcloud2.TimeOptions = options
         self._problems: list[str] = []
-        with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
+        with closing(bag_reader.open_bag(self._path, self._parts, self._problems)) as reader:
             topics = bag_reader.topic_types(reader)
         choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
         kind = bag_reader.first_kind(topics, (POINT_CLOUD, *livox.KINDS), topic)

@@ -71,6 +71,8 @@ class BagDataset(Loader):
         choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
         kind = bag_reader.first_kind(topics, (POINT_CLOUD, *livox.KINDS), topic)
         self.topic = choose(kind or POINT_CLOUD, topic)
+        if kind in livox.KINDS and options.get("time_unit") is None:
+            options["time_unit"] = livox.TIME_UNIT
         self.imu_topic = None
         if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
             self.imu_topic = choose(IMU, imu_topic)

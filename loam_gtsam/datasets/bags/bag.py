@@ -5,6 +5,7 @@ Sweeps are ``PointCloud2``, or the ``CustomMsg`` of Livox.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -17,7 +18,14 @@ import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
-from loam_gtsam.datasets.decode import aiding, extrinsics, livox, pointcloud2, tables
+from loam_gtsam.datasets.decode import (
+    aiding,
+    extrinsics,
+    livox,
+    pointcloud2,
+    sweep_parts,
+    tables,
+)
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import (
     IGNORE_TIMES,
@@ -160,11 +168,15 @@ class BagDataset(Loader):
         """Decide on the times, once for the whole run, and collect what there is to say."""
         decoded: list[pointcloud2.Decoded] = []
         stamps: list[int] = []
+        received: list[int] = []
+        frames = Counter[str]()
         failure = fields = ""
         for message in islice(self._messages(self.topic, []), _PEEK):
             if isinstance(message, BadSweep):
                 failure = failure or message.message
                 continue
+            received.append(message.received)
+            frames[str(getattr(message.content.header, "frame_id", "")).strip("/")] += 1
             try:
                 decoded.append(self._decode(message))
             except LoamError as error:
@@ -177,7 +189,8 @@ class BagDataset(Loader):
             stamps.append(decoded[-1].scan.stamp)
         if not decoded:
             text = f"no sweep can be decoded: {failure or 'it has no messages'}"
-            raise DatasetError(f"{self._path}, topic {self.topic}: {text}")
+            hint = sweep_parts.packets_hint(received)
+            raise DatasetError(f"{self._path}, topic {self.topic}: {text}{hint}")
         if problem := span_problem((d.scan.times for d in decoded), usual_step(stamps)):
             raise DatasetError(f"{self._path}, topic {self.topic}: {problem}; give {IGNORE_TIMES}")
         # The last one: near time zero an absolute time can still look like an offset.
@@ -193,6 +206,8 @@ class BagDataset(Loader):
             "point times": str(self._decision or "none recorded"),
             "rings": _describe_rings(decoded[0].scan),
         }
+        if problem := sweep_parts.sweep_problem(frames, [d.scan for d in decoded]):
+            self._problems.append(problem)
         if self._decision is None and self._options.get("time_field") != pointcloud2.NO_TIMES:
             self._problems.append("no per-point time field: times can only come from the azimuth")
         if outliers := sum(d.outliers for d in decoded):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -315,8 +316,14 @@ def find_sweeps(path: Path) -> Path | None:
 
 
 def _counts(folder: Path) -> dict[str, int]:
-    """How many files of each kind a folder has."""
-    return {suffix: len(list(folder.glob(f"{_SHOWN}{suffix}"))) for suffix in SUFFIXES}
+    """How many files of each kind a folder has, all in one look at it."""
+    counts = dict.fromkeys(SUFFIXES, 0)
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            suffix = os.path.splitext(name)[1]
+            if suffix in counts and not name.startswith("."):
+                counts[suffix] += 1
+    return counts
 
 
 def _sweep_files(folder: Path, root: Path, problems: list[str]) -> list[Path]:

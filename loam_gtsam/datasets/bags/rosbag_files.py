@@ -141,7 +141,7 @@ class _Database(Sqlite3Reader):
     def open(self) -> None:
         try:
             super().open()
-        except KeyError:
+        except (KeyError, AssertionError):  # as older and newer rosbags put it
             place = Path(str(self.path)).resolve().as_uri()
             database: Any = sqlite3.connect(f"{place}?immutable=1", uri=True)
             try:

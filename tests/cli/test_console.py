@@ -1,5 +1,9 @@
 """Results that took long to compute are written, if not where they are wanted, then elsewhere."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
 from loam_gtsam.cli.console import write_results
@@ -47,3 +51,17 @@ def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path):
 
     with pytest.raises(OutputError, match=r"^disk full$"):
         write_results(tmp_path, [], "results", write)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a full disk at hand")
+def test_a_full_disk_at_the_standard_output_is_one_sentence():
+    command = [sys.executable, "-m", "loam_gtsam.cli", "config"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: standard output: ")
+    assert "No space left" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    shown = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert shown.stdout.startswith("#")
+    assert shown.stderr == ""

@@ -104,6 +104,21 @@ def test_the_message_of_a_livox_is_read_with_its_times_and_without_rings(
     assert len(BagDataset(both, topic="/livox/lidar")) == 3
 
 
+@pytest.mark.parametrize("hertz", [50, 100])
+def test_short_messages_of_a_livox_count_nanoseconds(tmp_path: Path, hertz: int) -> None:
+    times = np.linspace(0.0, 0.99 / hertz, 301)
+    stamps = [START + i * 10**9 // hertz for i in range(3)]
+    recording: Recording = [
+        ("/livox/lidar", s, livox(ROS1, s, sweep_points(i, 301), times))
+        for i, s in enumerate(stamps)
+    ]
+    path = write_bag(tmp_path / "run", "ros1", recording)
+    for scan in open_dataset(path):
+        np.testing.assert_allclose(scan.times, times, atol=1e-9)
+    scan = next(iter(open_dataset(path, time_unit="us", time_field="none")))
+    assert scan.times is None
+
+
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3"])
 def test_a_livox_message_that_is_cut_off_is_a_bad_sweep(kind: str) -> None:
     store = store_of(kind)
@@ -225,7 +240,10 @@ def test_truncated_bags_cannot_be_opened(tmp_path: Path) -> None:
 def test_what_a_reader_says_of_a_damaged_bag_is_cut(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run", "sqlite3", sweeps("sqlite3"))
     metadata = bag / "metadata.yaml"
-    metadata.write_text(re.sub(r"RIHS01_\w+", "x" * 20_000, metadata.read_text()))
+    found = re.sub(
+        r"storage_identifier: \w+", f"storage_identifier: {'x' * 20_000}", metadata.read_text()
+    )
+    metadata.write_text(found)
     with pytest.raises(DatasetError, match="cannot open the bag") as caught:
         open_dataset(bag)
     assert len(str(caught.value)) < 1_000

@@ -108,7 +108,8 @@ def test_times_of_files_are_read_as_asked(tmp_path):
     np.testing.assert_allclose((scan.times[0], scan.times[-1]), (-0.09, 0.0), atol=1e-9)
     with pytest.raises(DatasetError, match="time_unit: expected one of"):
         open_dataset(tmp_path, time_unit="h")
-    five(tmp_path)
+    for number in range(4):
+        five(tmp_path, f"{number}.bin")
     with pytest.raises(DatasetError, match=r"\.bin files have no fields for time_field, time_unit"):
         open_dataset(tmp_path, time_unit="ms")
 

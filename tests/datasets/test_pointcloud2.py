@@ -213,6 +213,39 @@ def test_nan_points_take_their_columns_along() -> None:
     assert np.isfinite(decoded.scan.points).all()
 
 
+@pytest.mark.parametrize("fill", [0.0, np.nan])
+@pytest.mark.parametrize(
+    "times", [SWEEP + STAMP * 1e-9, SWEEP * 1e9 + float(STAMP), SWEEP + 991.5, STAMP + SWEEP * 1e9]
+)
+def test_missing_returns_at_time_zero_beside_absolute_times(fill: float, times: np.ndarray) -> None:
+    columns, gone = {**xyz(), "timestamp": times.copy()}, np.arange(N) % 3 == 0
+    measured = decode_with_times(make_message({k: v[~gone] for k, v in columns.items()}))
+    for name in columns:
+        columns[name][gone] = 0.0 if name == "timestamp" else fill
+    decoded = decode_with_times(make_message(columns))
+    assert decoded.decision == measured.decision
+    kept = decoded.scan.points.any(axis=1)
+    np.testing.assert_array_equal(decoded.scan.points[kept], measured.scan.points)
+    np.testing.assert_allclose(decoded.scan.times[kept], measured.scan.times, atol=1e-6)
+    assert np.ptp(decoded.scan.times) < 0.11
+    for name in "xyz":
+        columns[name][:] = fill
+    columns["timestamp"][:] = 0.0
+    nothing = decode_with_times(make_message(columns), decision=measured.decision)
+    assert not nothing.scan.points.any()
+
+
+@pytest.mark.parametrize("stamp_is", [None, "end"])
+def test_times_of_missing_returns_count_if_they_are_of_the_sweep(stamp_is: str | None) -> None:
+    columns = {**xyz(), "time": SWEEP.astype("f4")}
+    usual = decode_with_times(make_message(columns), stamp_is=stamp_is)
+    for name in "xyz":
+        columns[name][:5] = 0.0  # the first firing is at time zero
+    decoded = decode_with_times(make_message(columns), stamp_is=stamp_is)
+    assert decoded.decision == usual.decision
+    np.testing.assert_array_equal(decoded.scan.times, usual.scan.times)
+
+
 def test_range_image_keeps_its_rows() -> None:
     columns = {**xyz(), "t": np.tile((np.linspace(0, 0.1, N // 8) * 1e9).astype("u4"), 8)}
     columns["x"] = columns["x"].copy()

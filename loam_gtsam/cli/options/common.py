@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
+import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -61,7 +64,8 @@ class Options:
 def command(function: Callable[[Any], int | None]) -> Callable[..., None]:
     """Make a function of one dataclass of options, which returns an exit code, one for typer.
 
-    A ``LoamError`` becomes one message on stderr and the exit code 1.
+    A ``LoamError``, and an ``OSError`` of the standard output, become one message on stderr and the
+    exit code 1.
     """
     (group,) = (kind for name, kind in get_type_hints(function).items() if name != "return")
 
@@ -74,11 +78,14 @@ def command(function: Callable[[Any], int | None]) -> Callable[..., None]:
         except KeyboardInterrupt:
             typer.echo("stopped; nothing was computed yet", err=True)
             code = 130
-        except LoamError as error:
-            if options.debug:
+        except (LoamError, OSError) as error:
+            closed = isinstance(error, BrokenPipeError)  # typer ends quietly: `| head` has enough
+            if closed or options.debug:
                 raise
+            what = "standard output: " if isinstance(error, OSError) and _output_is_lost() else ""
+            hint = "; results in files are written before they are shown" if what else ""
             typer.secho("error: ", fg=typer.colors.RED, bold=True, err=True, nl=False)
-            typer.echo(str(error), err=True)
+            typer.echo(f"{what}{error}{hint}", err=True)
             code = 1
         raise typer.Exit(code or 0)
 
@@ -96,6 +103,18 @@ def command(function: Callable[[Any], int | None]) -> Callable[..., None]:
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     vars(call)["__signature__"] = inspect.Signature(parameters)
     return call
+
+
+def _output_is_lost() -> bool:
+    """Whether not even a line end can be printed; it is dropped then, so that Python can exit."""
+    try:
+        sys.stdout.write("\n")
+        sys.stdout.flush()
+    except OSError:
+        with suppress(OSError):  # no file behind it
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 @dataclass(frozen=True, kw_only=True)

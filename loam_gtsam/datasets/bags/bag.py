@@ -5,6 +5,7 @@ Sweeps are ``PointCloud2``, or the ``CustomMsg`` of Livox.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -17,7 +18,14 @@ import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
-from loam_gtsam.datasets.decode import aiding, extrinsics, livox, pointcloud2, tables
+from loam_gtsam.datasets.decode import (
+    aiding,
+    extrinsics,
+    livox,
+    pointcloud2,
+    sweep_parts,
+    tables,
+)
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import (
     IGNORE_TIMES,
@@ -66,11 +74,13 @@ class BagDataset(Loader):
         self.sensor: Mapping[str, Any] = {}
         self._options: pointcloud2.TimeOptions = options
         self._problems: list[str] = []
-        with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
+        with closing(bag_reader.open_bag(self._path, self._parts, self._problems)) as reader:
             topics = bag_reader.topic_types(reader)
         choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
         kind = bag_reader.first_kind(topics, (POINT_CLOUD, *livox.KINDS), topic)
         self.topic = choose(kind or POINT_CLOUD, topic)
+        if kind in livox.KINDS and options.get("time_unit") is None:
+            options["time_unit"] = livox.TIME_UNIT
         self.imu_topic = None
         if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
             self.imu_topic = choose(IMU, imu_topic)
@@ -158,11 +168,15 @@ class BagDataset(Loader):
         """Decide on the times, once for the whole run, and collect what there is to say."""
         decoded: list[pointcloud2.Decoded] = []
         stamps: list[int] = []
+        received: list[int] = []
+        frames = Counter[str]()
         failure = fields = ""
         for message in islice(self._messages(self.topic, []), _PEEK):
             if isinstance(message, BadSweep):
                 failure = failure or message.message
                 continue
+            received.append(message.received)
+            frames[str(getattr(message.content.header, "frame_id", "")).strip("/")] += 1
             try:
                 decoded.append(self._decode(message))
             except LoamError as error:
@@ -175,7 +189,8 @@ class BagDataset(Loader):
             stamps.append(decoded[-1].scan.stamp)
         if not decoded:
             text = f"no sweep can be decoded: {failure or 'it has no messages'}"
-            raise DatasetError(f"{self._path}, topic {self.topic}: {text}")
+            hint = sweep_parts.packets_hint(received)
+            raise DatasetError(f"{self._path}, topic {self.topic}: {text}{hint}")
         if problem := span_problem((d.scan.times for d in decoded), usual_step(stamps)):
             raise DatasetError(f"{self._path}, topic {self.topic}: {problem}; give {IGNORE_TIMES}")
         # The last one: near time zero an absolute time can still look like an offset.
@@ -191,6 +206,8 @@ class BagDataset(Loader):
             "point times": str(self._decision or "none recorded"),
             "rings": _describe_rings(decoded[0].scan),
         }
+        if problem := sweep_parts.sweep_problem(frames, [d.scan for d in decoded]):
+            self._problems.append(problem)
         if self._decision is None and self._options.get("time_field") != pointcloud2.NO_TIMES:
             self._problems.append("no per-point time field: times can only come from the azimuth")
         if outliers := sum(d.outliers for d in decoded):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -9,9 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag2 import ReaderError as ReaderError2
+from rosbags.serde import SerdeError
+from rosbags.typesys import TypesysError
 
+from loam_gtsam.datasets.bags.rosbag_files import RosbagFiles
 from loam_gtsam.datasets.decode import aiding, livox
 from loam_gtsam.datasets.decode.pointcloud2 import decode_imu
 from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS, clean_imu
@@ -22,6 +26,7 @@ MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_register
 """Topics on which LOAM and A-LOAM publish clouds in the map."""
 _MOST = 2**63 - 1
 """Neither a length nor nanoseconds are larger; a bag without messages starts there."""
+_SENTENCES = ReaderError1, ReaderError2, SerdeError, TypesysError
 _LONGEST = 500  # letters of what a reader says of a damaged bag, parts of which it may quote
 
 
@@ -42,15 +47,21 @@ class Message:
     content: Any
 
 
-def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
-    """An opened reader of a bag, or of ``parts`` that ``path`` names; DatasetError if damaged."""
+def open_bag(
+    path: Path, parts: Sequence[Path] = (), problems: list[str] | None = None
+) -> RosbagFiles:
+    """An opened reader of a bag, or of ``parts`` that ``path`` names; DatasetError if damaged.
+
+    ``problems`` gets what it cannot read.
+    """
     bags = list(parts or [path])
     if missing := [bag for bag in bags if not bag.exists()]:
         raise DatasetError(f"{missing[0]}: no such bag")
-    store = Stores.ROS1_NOETIC if bags[0].suffix == ".bag" else Stores.LATEST
+    unread = _write_ahead_logs(bags)
+    if problems is not None:
+        problems += [text for text in unread if text not in problems]
     try:
-        reader = AnyReader(bags, default_typestore=get_typestore(store))
-        reader.open()
+        reader = RosbagFiles(bags)
         try:
             check_metadata(reader)
         except BaseException:
@@ -58,14 +69,40 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
             raise
     # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
     except Exception as error:
-        raise DatasetError(
-            f"{path}: cannot open the bag: {_reason(error)}; if the recording was cut off, `rosbag "
-            "reindex` (ROS 1), `ros2 bag reindex` or `mcap recover` may repair it"
-        ) from error
+        what = "; ".join([_reason(error), *(unread or _remedy(error))])
+        raise DatasetError(f"{path}: cannot open the bag: {what}") from error
     return reader
 
 
-def check_metadata(reader: AnyReader) -> None:
+def _write_ahead_logs(bags: Sequence[Path]) -> list[str]:
+    """What is said of logs beside databases, whose messages rosbags does not read."""
+    files = (
+        file for bag in bags for file in (sorted(bag.glob("*.db3")) if bag.is_dir() else [bag])
+    )
+    logs = [(file, file.with_name(f"{file.name}-wal")) for file in files]
+    return [
+        f"{log.name} ({log.stat().st_size} bytes) is not read and may hold the newest messages: "
+        "the recording still goes on, or was killed. When it has ended, `sqlite3 "
+        f"{file.name} 'pragma wal_checkpoint(truncate)'` moves them into the bag"
+        for file, log in logs
+        if log.is_file() and log.stat().st_size
+    ]
+
+
+def _remedy(error: Exception) -> list[str]:
+    """What can be done about a bag that cannot be opened, if anything."""
+    text = str(error)
+    if "Profile is not" in text:
+        return ["MCAP files of ROS 2 are read; of one of ROS 1, give the .bag that it was made of"]
+    if isinstance(error, PermissionError) or "not supported" in text:
+        return []
+    return [
+        "if the recording was cut off, `rosbag reindex` (ROS 1), `ros2 bag reindex` or `mcap "
+        "recover` may repair it"
+    ]
+
+
+def check_metadata(reader: RosbagFiles) -> None:
     """ValueError unless the names and numbers of messages that a bag states make sense."""
     for connection in reader.connections:
         name, count = connection.topic, connection.msgcount
@@ -78,10 +115,9 @@ def check_metadata(reader: AnyReader) -> None:
         raise ValueError(f"expected a start in nanoseconds, got {reader.start_time!r}")
 
 
-def topic_types(reader: AnyReader) -> dict[str, tuple[str, int]]:
+def topic_types(reader: RosbagFiles) -> dict[str, tuple[str, int]]:
     """Topic -> (message type, number of messages)."""
-    topics = sorted(reader.topics.items())
-    return {topic: (info.msgtype or "several types", info.msgcount) for topic, info in topics}
+    return dict(reader.topics)
 
 
 def choose_topic(
@@ -154,13 +190,16 @@ def read_messages(
 
     One that cannot be deserialised is a :class:`BadSweep`; one ends the stream of a damaged file.
     """
-    with closing(open_bag(path, parts)) as reader:
-        stream = reader.messages([c for c in reader.connections if c.topic in topics])
+    with closing(open_bag(path, parts, problems)) as reader:
+        stream, came = reader.messages(topics), Counter[str]()
         last, interval = reader.start_time, DEFAULT_PERIOD_NS
         while True:
             try:
                 connection, received, raw = next(stream)
             except StopIteration:
+                promised = {name: count for name, (_, count) in reader.topics.items()}
+                missing = _missing(path, {t: promised.get(t, 0) for t in topics}, came)
+                problems += [text for text in missing if text not in problems]
                 return
             except Exception as error:  # as in open_bag
                 when = f"damaged after {last * 1e-9:.3f} s"
@@ -171,6 +210,7 @@ def read_messages(
                 return
             interval = received - last if received > last else interval
             last = received
+            came[connection.topic] += 1
             try:
                 if connection.msgtype in livox.KINDS:
                     content: Any = livox.read_custom(raw, cdr=reader.is2)
@@ -181,6 +221,17 @@ def read_messages(
                 yield BadSweep(received, text)
                 continue
             yield Message(connection.topic, received, content)
+
+
+def _missing(path: Path, promised: Mapping[str, int], came: Mapping[str, int]) -> list[str]:
+    """What is said of topics that were read to the end and have fewer messages than promised."""
+    return [
+        f"{came.get(topic, 0)} of {count} messages of {topic} came; the metadata of {path.name} "
+        "promise more than its files hold, or files are cut off: copy the recording once more, or "
+        "`ros2 bag reindex` (ROS 2), `rosbag reindex` (ROS 1)"
+        for topic, count in promised.items()
+        if came.get(topic, 0) < count
+    ]
 
 
 def read_imu(
@@ -210,6 +261,6 @@ def _reason(error: Exception) -> str:
     text = str(error).rstrip(".")
     if isinstance(error, UnicodeDecodeError):
         text = "its first bytes are not those of a bag"
-    elif not isinstance(error, AnyReaderError):
+    elif not isinstance(error, _SENTENCES):
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
     return text[:_LONGEST]

@@ -62,7 +62,7 @@ class LoamTopicsDataset(Loader):
         self.sensor: Mapping[str, Any] = {}
         self.unmatched: dict[str, int] = {}
         self._problems: list[str] = []
-        with closing(bag_reader.open_bag(self._path)) as reader:
+        with closing(bag_reader.open_bag(self._path, problems=self._problems)) as reader:
             self._types = bag_reader.topic_types(reader)
         if missing := [topic for topic in loam_messages.REQUIRED if topic not in self._types]:
             listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())

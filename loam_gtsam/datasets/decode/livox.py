@@ -18,6 +18,8 @@ KINDS = (
     "livox_interfaces/msg/CustomMsg",
 )
 """The same message of the drivers for ROS 1 and 2, old and new."""
+TIME_UNIT = "ns"
+"""Of ``offset_time``, by its definition; messages of 50 or 100 Hz are too short to tell it."""
 _BYTES = ("reflectivity", "u1"), ("tag", "u1"), ("laser", "u1")
 _POINT = np.dtype([("offset_time", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *_BYTES])
 _ALIGNED = np.dtype([*_POINT.descr, ("filled", "V1")])

@@ -14,7 +14,7 @@ from loam_gtsam.datasets.decode.point_times import (
     check_time_options,
     decide_times,
 )
-from loam_gtsam.types import DatasetError, LoamError, Scan
+from loam_gtsam.types import BoolArray, DatasetError, LoamError, Scan
 
 RING_FIELDS = ("ring", "channel", "line")
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "time_stamp", "offset_time")
@@ -23,6 +23,10 @@ NO_TIMES = "none"
 
 _WILD_RING = 2.0**31
 """Bound of beam numbers; larger floats, which no integer holds, are clipped to it."""
+
+_MOST_OF_THEM = 0.01, 0.99
+"""Quantiles of times between which a sweep spans less than its distance from an absolute zero."""
+_SAMPLED = 1000  # times, about, of which these are taken
 
 _OPEN = 10
 """Sweeps that decide for themselves: near time zero an absolute time can still look like an
@@ -108,18 +112,19 @@ def decode_with_times(
             values = (values[0], values[1][order]) if values is not None else None
     finite = np.isfinite(points).all(axis=1)
     times = None
-    if values is not None and finite.any():
+    # Only measured points: drivers leave anything in the time of a missing return.
+    there = finite if values is None else _measured(points, finite, values[1], decision)
+    if values is not None and there.any():
         name, column = values
-        # Only measured points: drivers leave anything in the time of a missing return.
-        measured = column[finite]
+        measured = column[there]
         if decision is None:
             decision = decide_times(measured, stamp, field=name, unit=unit, stamp_is=stamp_is)
         measured_times, outlier = apply_times(measured, stamp, decision)
         outliers = int(outlier.sum())
         times = np.full(len(points), measured_times.min())
-        times[finite] = measured_times
+        times[there] = measured_times
         if outliers:
-            points[np.flatnonzero(finite)[outlier]] = np.nan
+            points[np.flatnonzero(there)[outlier]] = np.nan
             finite = np.isfinite(points).all(axis=1)
     elif values is not None:
         times = np.zeros(len(points))
@@ -129,6 +134,30 @@ def decode_with_times(
         rings = rings[finite] if rings is not None else None
     scan = Scan(points=points, stamp=stamp, times=times, rings=rings, rows=rows)
     return Decoded(scan, decision if values is not None else None, outliers)
+
+
+def _measured(
+    points: NDArray[Any], finite: BoolArray, column: NDArray[Any], decision: TimeDecision | None
+) -> BoolArray:
+    """The finite points, without (0, 0, 0) at time 0 where the times of the others are absolute.
+
+    Several drivers write missing returns so.
+    """
+    missing = np.flatnonzero(finite & (column == 0))
+    missing = missing[~points[missing].any(axis=1)]
+    if not len(missing):
+        return finite
+    measured = finite.copy()
+    measured[missing] = False
+    others = column[measured]
+    with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive it
+        others = others[:: len(others) // _SAMPLED + 1].astype(np.float64)
+    others = others[np.isfinite(others)]
+    absolute = decision is not None and decision.clock != "offset"
+    if len(others):
+        low, high = np.quantile(others, _MOST_OF_THEM)
+        absolute = low > high - low
+    return measured if absolute else finite
 
 
 class CloudStream:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from loam_gtsam.datasets.decode import tables
 from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.point_times import SWEEP_SECONDS
+from loam_gtsam.datasets.kitti.file_names import stamps_of_names
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
@@ -34,7 +35,9 @@ _FAR = 1e6  # metres and degrees that no packet has
 _BRIDGED_NS = 100_000_000  # default of ``imu.max_gap``
 
 
-def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntArray:
+def sweep_stamps(
+    root: Path, files: Sequence[Path], facts: dict[str, str], problems: list[str]
+) -> IntArray:
     """Nanoseconds of each sweep, by ``times.txt``, their names or KITTI's ``timestamps.txt``."""
     names = [re.search(r"__(\d{16})(\.|$)", file.stem) for file in files]
     path, raw = root / "times.txt", root / _RAW / "timestamps.txt"
@@ -54,8 +57,7 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
         if missing := len(dates) - len(stamps):
             problems.append(f"{missing} sweeps of {path.name} have no file")
     else:
-        problems.append("no times.txt: 10 Hz assumed")
-        return np.arange(len(files), dtype=np.int64) * tables.DEFAULT_PERIOD_NS
+        return stamps_of_names(files, facts, problems)
     if len(stamps) != len(files):
         counts = f"{len(stamps)} stamps for {len(files)} sweeps"
         raise DatasetError(f"{path}: {counts}; expected one line for each file")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,6 +40,7 @@ from loam_gtsam.datasets.decode.pointcloud2 import (
     describe_fields,
 )
 from loam_gtsam.datasets.kitti import drive
+from loam_gtsam.datasets.kitti.file_names import in_order, without_strays
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
@@ -64,10 +64,10 @@ READERS = {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy}
 """Readers of the files that tell their own fields."""
 SUFFIXES = (".bin", *READERS)
 _TRIED = 10  # sweeps looked at, at most, to describe their fields
+_NAMED = 5  # files that are left out, at most, whose names are said
 _MOST_RINGS = 256  # a fifth column with more different values is no beam
 
 _SHOWN = "[!.]*"  # not those that begin with a dot: macOS's ._000000.bin is no sweep
-_NUMBER = re.compile(r"(\d+(?:\.\d+)?)")
 _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
 
 
@@ -123,8 +123,9 @@ class KittiDataset(SweepFiles):
         folder = _sweep_folder(given)
         self._root = _root_of(folder, given)
         self.name = given.resolve().name or "sweeps"
-        suffix = _suffix_in(folder)
-        self._files = _in_order(list(folder.glob(f"{_SHOWN}{suffix}")))
+        self._problems: list[str] = []
+        self._files = _sweep_files(folder, self._root, self._problems)
+        suffix = self._files[0].suffix
         if columns not in (None, 4, 5):
             raise DatasetError(f"columns: expected 4 or 5, got {columns!r}")
         options: TimeOptions = {
@@ -140,8 +141,8 @@ class KittiDataset(SweepFiles):
             self._record = XYZI_RING
         self._times_folder = self._root / "t_ns"
         self._imu_file = first_existing(self._root, ["imu.csv", "imu0/data.csv"])
-        self._problems: list[str] = []
-        self.stamps = drive.sweep_stamps(self._root, self._files, self._problems)
+        self._facts: dict[str, str] = {}
+        self.stamps = drive.sweep_stamps(self._root, self._files, self._facts, self._problems)
         self._camera_T_lidar = drive.camera_T_lidar_of(self._root)
         self._oxts = drive.read_oxts(self._root)
         self._lidar_T_imu = None if self._oxts is None else drive.lidar_T_imu_of(self._root)
@@ -192,6 +193,7 @@ class KittiDataset(SweepFiles):
         kind = "KITTI folder" if suffix == ".bin" else f"folder of {suffix} files"
         info = DatasetInfo(kind, str(self._path), {"sweeps": str(len(self))})
         tables.describe_stamps(self.stamps, info.facts, info.problems)
+        info.facts |= self._facts
         decision, info.facts["fields"] = self._first
         info.facts["point times"] = str(decision or "none recorded")
         sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
@@ -303,18 +305,50 @@ def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.fl
 
 
 def find_sweeps(path: Path) -> Path | None:
-    """The folder in or below ``path`` that holds sweeps, None if there is none."""
+    """The folder in or below ``path`` that holds sweeps, None if there is none.
+
+    The first with any; a lone file, such as a map, is none where another folder has several.
+    """
     folders = (path / name for name in _FOLDERS if (path / name).is_dir())
-    return next((folder for folder in folders if _suffix_in(folder)), None)
+    counts = {folder: max(_counts(folder).values()) for folder in folders}
+    several = next((folder for folder, count in counts.items() if count > 1), None)
+    return several or next((folder for folder, count in counts.items() if count), None)
 
 
-def _suffix_in(folder: Path) -> str:
-    """The kind of file of which a folder has most, empty if it has none; .bin before others."""
-    if any(folder.glob(f"{_SHOWN}.bin")):
-        return ".bin"
-    counts = {suffix: len(list(folder.glob(f"{_SHOWN}{suffix}"))) for suffix in READERS}
-    suffix = max(counts, key=counts.__getitem__)
-    return suffix if counts[suffix] else ""
+def _counts(folder: Path) -> dict[str, int]:
+    """How many files of each kind a folder has, all in one look at it."""
+    counts = dict.fromkeys(SUFFIXES, 0)
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            suffix = os.path.splitext(name)[1]
+            if suffix in counts and not name.startswith("."):
+                counts[suffix] += 1
+    return counts
+
+
+def _sweep_files(folder: Path, root: Path, problems: list[str]) -> list[Path]:
+    """The files of the kind of which a folder has most, in order, but for those named otherwise.
+
+    What is left out is named in ``problems``.
+    """
+    counts = _counts(folder)
+    suffix = max(counts, key=counts.__getitem__)  # the first of equals: .bin
+    files = list(folder.glob(f"{_SHOWN}{suffix}"))
+    for kind, count in counts.items():
+        if count and kind != suffix:
+            which = f"{count} {kind} files" if count > 1 else f"1 {kind} file"
+            problems.append(f"{which} left out: the sweeps are the {len(files)} {suffix} files")
+    sweeps, others = without_strays(files)
+    times = root / "times.txt"
+    if others and not (times.is_file() and len(tables.read_lines(times)) == len(files)):
+        names = ", ".join(sorted(file.name for file in others)[:_NAMED])
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        problems.append(
+            f"{names}{more} left out: named otherwise than the {len(sweeps)} sweeps "
+            f"({min(sweeps).name}, ...); a sweep among them needs a name like theirs"
+        )
+        return in_order(sweeps)
+    return in_order(files)
 
 
 def _columns_of(files: Sequence[Path]) -> int:
@@ -355,15 +389,3 @@ def _root_of(folder: Path, given: Path) -> Path:
     folder = folder.resolve()
     inner = next((name for name in _FOLDERS[1:] if folder.match(name)), None)
     return given if inner is None else folder.parents[inner.count("/")]
-
-
-def _in_order(files: Sequence[Path]) -> list[Path]:
-    """By the numbers in the names where all else in these is the same (``scan_9, scan_10``)."""
-    parts = {file: _NUMBER.split(file.stem) for file in files}
-    if len({tuple(part[::2]) for part in parts.values()}) == 1:
-        return sorted(files, key=lambda file: ([Decimal(n) for n in parts[file][1::2]], file.name))
-    return sorted(files, key=_by_name)
-
-
-def _by_name(file: Path) -> tuple[int, str]:
-    return (int(file.stem) if file.stem.isdecimal() else -1, file.name)

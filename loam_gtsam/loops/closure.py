@@ -145,7 +145,9 @@ class Verifier:
 
         def fit(found: Solution) -> Fit:
             offered = _offered(len(edges), len(planes), matching)
-            return standing_fit(found.matches, offered, _LEVEL) if found.solved else Fit(0.0, 0.0)
+            if not found.solved:
+                return Fit(0.0, 0.0)
+            return standing_fit(found.matches, offered, _LEVEL, matching.max_distance)
 
         solution = self._solver.solve(matches_at, known)
         if self._judged(fit(solution), usual) is not None:
@@ -175,9 +177,10 @@ class Verifier:
 
     def share(self, edges: FloatArray, planes: FloatArray, maps: tuple[CubeMap, CubeMap]) -> float:
         """Share of features off level ground that have a match in the maps as they are."""
-        matches = associate(edges, planes, gtsam.Pose3(), *maps, self._whole.matching)
-        offered = _offered(len(edges), len(planes), self._whole.matching)
-        return standing_fit(matches, offered, _LEVEL).share
+        matching = self._whole.matching
+        matches = associate(edges, planes, gtsam.Pose3(), *maps, matching)
+        offered = _offered(len(edges), len(planes), matching)
+        return standing_fit(matches, offered, _LEVEL, matching.max_distance).share
 
     def _judged(self, fit: Fit, usual: float) -> Rejection | None:
         """The reason to reject a registration; None if it is believed."""

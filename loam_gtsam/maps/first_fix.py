@@ -112,7 +112,8 @@ class PlaceSearch:
             solution = self._solver.solve(trial, start)
             if solution.solved:
                 pose = solution.map_T_lidar
-                fit = standing_fit(solution.matches, trial.offered, pose)
+                reach = trial.matching.max_distance
+                fit = standing_fit(solution.matches, trial.offered, pose, reach)
                 found.append(Candidate(pose, fit, Evidence.of(trial, solution, dense=True)))
         found.sort(key=lambda c: -c.fit.margin)
         found = distinct(found, lambda c: c.map_T_middle)

@@ -44,6 +44,7 @@ _BASIN = 0.5
 _TOLD = 3  # times that a sweep which fits with no expected motion tells one by itself
 _ANY = 1e3  # rad/s and m/s: standard deviation of a motion of which nothing is known
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
+_CONTRARY = "fits better as if no IMU had been there: one of the two is wrong"
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 
 
@@ -68,6 +69,7 @@ class Found:
     in_vain: bool = False  # whether it was looked for elsewhere, as it fits unusually little here
     searched: float = 0.0  # metres around, in which that was, if no acceleration leads here
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
+    contrary: str = ""  # sentence for the user if the sweep fits better without the IMU
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,9 +178,10 @@ def placed(
         doubt = doubtful(frame, found.solution, monitor, last.twist)
     if imu is not None and frame is not given:
         imu.reject()
-    if doubt is not None:
-        return frame, search(frame, found.solution, monitor, solver, doubt)
-    return frame, found
+    place = found if doubt is None else search(frame, found.solution, monitor, solver, doubt)
+    if isinstance(place, Found) and frame.sweep.motion is not given.sweep.motion:
+        place = replace(place, contrary=_CONTRARY)
+    return frame, place
 
 
 def _solved(frame: Frame, solver: ScanSolver) -> Found:

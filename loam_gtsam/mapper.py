@@ -276,7 +276,6 @@ class Mapper:
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
-        contrary = found.contrary
         if self.start is not None:
             frame, found = self.start.add(frame, found, self.maps.keyframe, self._named, self.imu)
             self.start = None if self.start.complete else self.start
@@ -291,9 +290,7 @@ class Mapper:
             self.errors.jumped(*step, unlike=unlike, searched=found.searched)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
-        message = found.message or self.point_times.problem or said
-        message = "; ".join(filter(None, (message, contrary)))
-        status, message = status_of(solution, message)
+        status, message = status_of(solution, found.saying(self.point_times.problem or said))
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
         of_sweep = posed.sweep, solution, scan, last, fused, *rivals, more

@@ -33,7 +33,6 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
 _STARTS = 3  # number of poses from the search around a candidate at which a trial starts
-_ANY = np.inf  # reach of a match: all count, as they do in the usual share of a keyframe
 _LEVEL = gtsam.Pose3()  # a lidar that stands upright in the frame of a place, which is level
 
 
@@ -146,9 +145,7 @@ class Verifier:
 
         def fit(found: Solution) -> Fit:
             offered = _offered(len(edges), len(planes), matching)
-            if not found.solved:
-                return Fit(0.0, 0.0)
-            return standing_fit(found.matches, offered, _LEVEL, _ANY)
+            return standing_fit(found.matches, offered, _LEVEL) if found.solved else Fit(0.0, 0.0)
 
         solution = self._solver.solve(matches_at, known)
         if self._judged(fit(solution), usual) is not None:
@@ -180,7 +177,7 @@ class Verifier:
         """Share of features off level ground that have a match in the maps as they are."""
         matches = associate(edges, planes, gtsam.Pose3(), *maps, self._whole.matching)
         offered = _offered(len(edges), len(planes), self._whole.matching)
-        return standing_fit(matches, offered, _LEVEL, _ANY).share
+        return standing_fit(matches, offered, _LEVEL).share
 
     def _judged(self, fit: Fit, usual: float) -> Rejection | None:
         """The reason to reject a registration; None if it is believed."""

@@ -112,8 +112,7 @@ class PlaceSearch:
             solution = self._solver.solve(trial, start)
             if solution.solved:
                 pose = solution.map_T_lidar
-                reach = trial.matching.max_distance
-                fit = standing_fit(solution.matches, trial.offered, pose, reach)
+                fit = standing_fit(solution.matches, trial.offered, pose)
                 found.append(Candidate(pose, fit, Evidence.of(trial, solution, dense=True)))
         found.sort(key=lambda c: -c.fit.margin)
         found = distinct(found, lambda c: c.map_T_middle)

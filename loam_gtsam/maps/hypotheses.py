@@ -56,9 +56,8 @@ class Hypothesis:
         seen = self._mapper.registered
         if not self.last.status.solved or seen is None or seen.matches is None:
             return False
-        config = self._mapper.maps.config
-        offered, reach = _offered(self.last, config), config.matching.max_distance
-        self.fits.append(standing_fit(seen.matches, offered, seen.map_T_middle, reach))
+        offered = _offered(self.last, self._mapper.maps.config)
+        self.fits.append(standing_fit(seen.matches, offered, seen.map_T_middle))
         last = [fit.agreement for fit in self.fits[-SWEEPS:]]
         return len(last) < SWEEPS or max(last) >= _CLEARLY[-1][0]
 
@@ -133,8 +132,8 @@ class Motion:
             return True
         if surely_placed(moved) is None or seen is None or seen.matches is None:
             return False
-        offered, reach = _offered(moved, self._config), self._config.matching.max_distance
-        fit = standing_fit(seen.matches, offered, seen.map_T_middle, reach)
+        offered = _offered(moved, self._config)
+        fit = standing_fit(seen.matches, offered, seen.map_T_middle)
         return fit.agreement >= self._config.loops.min_agreement
 
     @property

@@ -71,6 +71,10 @@ class Found:
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
     contrary: str = ""  # sentence for the user if the sweep fits better without the IMU
 
+    def saying(self, otherwise: str) -> str:
+        """Its sentences for the user, with another one if it was not moved."""
+        return "; ".join(filter(None, (self.message or otherwise, self.contrary)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lost:

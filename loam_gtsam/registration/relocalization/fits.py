@@ -90,8 +90,10 @@ def vague(matches: ScanMatches, reach: float) -> tuple[BoolArray, BoolArray]:
     return lines, surfaces
 
 
-def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3, reach: float) -> Fit:
-    """Fit of edges and of planes that are not level, of so many features; as :meth:`Fit.of`.
+def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -> Fit:
+    """Fit of edges and of planes that are not level, of so many features.
+
+    All matches count, as in the usual share of a keyframe and in the numbers of a frame.
 
     Level ground fits at any heading: with much of it, most matches of a wrong pose agree. Up is
     that of the lidar, for a map need not have one.
@@ -100,7 +102,7 @@ def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3, r
     standing = np.abs(matches.planes.normals @ up) < _LEVEL
     level = int(np.count_nonzero(~standing))
     upright = ScanMatches(matches.edges, subset(matches.planes, standing))
-    return Fit.of(upright, offered - level, reach)
+    return Fit.of(upright, offered - level, np.inf)
 
 
 def same(one: gtsam.Pose3, other: gtsam.Pose3, apart: tuple[float, float] = APART) -> bool:

@@ -290,7 +290,7 @@ class Mapper:
             self.errors.jumped(*step, unlike=unlike, searched=found.searched)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
-        status, message = status_of(solution, found.message or self.point_times.problem or said)
+        status, message = status_of(solution, found.saying(self.point_times.problem or said))
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
         of_sweep = posed.sweep, solution, scan, last, fused, *rivals, more

@@ -503,6 +503,9 @@ def test_a_gyro_that_begins_is_held_against_the_sweep_without_it(room, swapped, 
     assert (result.imu.gyro_left_out > 0) is swapped
     turned = result.updates[-1].sweep_motion
     assert turned is (SweepMotion.CONSTANT_VELOCITY if swapped else SweepMotion.GYRO)
+    told = [update for update in result.updates if "as if no IMU had been there" in update.message]
+    assert bool(told) is (swapped and begins > 0.0)
+    assert all(one.sweep_motion is SweepMotion.CONSTANT_VELOCITY for one in told)
 
 
 def test_recorded_features_are_levelled_too(shaken, sweeps):

@@ -33,6 +33,7 @@ _ADVICE = {
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _PIECE = " in another piece of map"  # in the message of the first frame there
 _MOVED = "moved by "  # in the message of a frame that was searched for
+_CONTRARY = "as if no IMU had been there"  # in that of a frame that fits better so
 _VAGUE = 0.01  # standard deviation from which on a pose is vague: rad, and part of the path
 _SAID = 1.0  # metres of standard deviation from which on a vague one is said
 _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground makes
@@ -53,7 +54,7 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         tell = "where it is, loops.enabled or a GNSS receiver may tell"
         notes.append(f"the run goes on{_PIECE} from frame {frames} on: {tell}")
     if result.imu is not None:
-        notes += [*result.imu.problems, *_uncovered(result, result.imu)]
+        notes += [*result.imu.problems, *_without_imu(result, result.imu)]
     if result.fixes is not None and result.fixes.reference is None:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.fixes is not None and result.fixes.antenna_problem:
@@ -84,19 +85,32 @@ def _on_loops(graph: PoseGraph) -> list[str]:
     ]
 
 
-def _uncovered(result: RunResult, imu: ImuSummary) -> list[str]:
-    """A sentence on sweeps that were mapped before their IMU samples came; none if few were."""
-    solved = [update.sweep_motion for update in result.updates if update.status.solved]
-    count = solved.count(SweepMotion.CONSTANT_VELOCITY)
-    asked = result.config.deskew.rotation != "constant_velocity" and not imu.gyro_left_out
-    # Without an orientation either, that is said already.
-    told = imu.report.orientation != "none" and imu.tilt_priors.get("dropped", 0) >= count
-    if not asked or told or count <= _TOO_MANY * len(solved):
+def _without_imu(result: RunResult, imu: ImuSummary) -> list[str]:
+    """Sentences on sweeps that were mapped without the IMU; none if few were.
+
+    Their samples came after them, or they fitted better as if there were none.
+    """
+    if result.config.deskew.rotation == "constant_velocity" or imu.gyro_left_out:
         return []
-    return [
-        f"IMU: its samples did not cover {count} of {len(solved)} sweeps when these were mapped; "
-        "add them before the sweep"
-    ]
+    solved = [update for update in result.updates if update.status.solved]
+    alone = [one for one in solved if one.sweep_motion is SweepMotion.CONSTANT_VELOCITY]
+    contrary = sum(_CONTRARY in update.message for update in alone)
+    late, few = len(alone) - contrary, _TOO_MANY * len(solved)
+    notes = []
+    # Without an orientation either, that is said already.
+    told = imu.report.orientation != "none" and imu.tilt_priors.get("dropped", 0) >= late
+    if late > few and not told:
+        notes.append(
+            f"IMU: its samples did not cover {late} of {len(solved)} sweeps when these were "
+            "mapped; add them before the sweep"
+        )
+    if contrary > few:
+        notes.append(
+            f"IMU: {contrary} of {len(solved)} sweeps fitted the map better without it: one of the "
+            "two is wrong; check imu.lidar_R_imu_deg, units and stamps; if the IMU is right, the "
+            "poses are wrong"
+        )
+    return notes
 
 
 def _why_vague(updates: Sequence[MapUpdate], largest: float) -> str:

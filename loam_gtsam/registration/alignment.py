@@ -122,7 +122,7 @@ def align(
         match = partial(associate, _NONE, points, edge_map=edges, plane_map=planes, config=matching)
         solution = solver.solve(match, pose, (), prior)
         pose = solution.map_T_lidar
-    fit = Fit.of(solution.matches, len(points))
+    fit = Fit.of(solution.matches, len(points), config.matching.max_distance)
     return Alignment(
         pose,
         _covariance(solution, config),

@@ -34,6 +34,7 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
+CONTRARY = "fits better as if no IMU had been there: one of the two is wrong"
 FRAMES = 8
 WORLD = SimulatedWorld("room", frames=FRAMES, columns=450)
 
@@ -308,9 +309,28 @@ def test_samples_that_come_after_their_sweep_are_a_note(result):
     assert not noted(replace(late, config=Config().changed("deskew.rotation=constant_velocity")))
     assert not noted(replace(late, imu=replace(result.imu, gyro_left_out=2)))
     assert not noted(replace(late, imu=None))
+    contrary = [replace(update, message=f"moved; {CONTRARY}") for update in alone]
+    assert not noted(replace(late, updates=tuple(contrary)))
     pipeline = Pipeline(QUICK, imu=ImuBuffer(QUICK.imu))
     (note,) = noted(pipeline.result([pipeline.process(WORLD[i]) for i in range(2)]))
     assert "1 of 1" in note
+
+
+def test_sweeps_that_fit_better_without_the_imu_are_another_note(result):
+    """Samples that cover them all were said to be missing."""
+
+    def noted(result):
+        return [note for note in result.notes if note.startswith("IMU: ")]
+
+    alone = replace(result.updates[-1], sweep_motion=SweepMotion.CONSTANT_VELOCITY)
+    contrary = replace(result, updates=(*result.updates[:-1], replace(alone, message=CONTRARY)))
+    (note,) = noted(contrary)
+    assert note.startswith("IMU: 1 of 7 sweeps fitted the map better without it: one of the two")
+    assert not noted(replace(contrary, imu=replace(result.imu, gyro_left_out=2)))
+    # Where a sweep that fits better without the IMU was lost, or turned by it again, none is.
+    for one in (replace(alone, status=FrameStatus.LOST), result.updates[-1]):
+        updates = *result.updates[:-1], replace(one, message=CONTRARY)
+        assert not noted(replace(result, updates=updates))
 
 
 @pytest.mark.parametrize(

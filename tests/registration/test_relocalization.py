@@ -27,7 +27,13 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.rollback import Before
 from loam_gtsam.pipeline import Pipeline, effective_config, run
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, subset
+from loam_gtsam.registration.matches import (
+    EdgeMatches,
+    PlaneMatches,
+    ScanMatches,
+    joined,
+    subset,
+)
 from loam_gtsam.registration.odometry import Moment, predict
 from loam_gtsam.registration.relocalization import (
     Doubt,
@@ -61,6 +67,7 @@ def with_search(**changes):
 
 
 OFF = with_search(enabled=False)
+REACH = 1.0  # metres
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +132,32 @@ def matches(edge_distances, plane_distances, sigma=0.1):
 
 
 def test_a_fit_counts_matches_within_three_sigmas_on_either_side():
-    fit = Fit.of(matches([0.0, 0.29, 0.31], [-0.29, -0.31]), offered=10)
+    fit = Fit.of(matches([0.0, 0.29, 0.31], [-0.29, -0.31]), 10, REACH)
     assert fit == Fit(share=0.5, agreement=0.6)
     assert fit.total == pytest.approx(0.3)
-    assert Fit.of(matches([], []), offered=10) == Fit(0.0, 0.0)
+    assert Fit.of(matches([], []), 10, REACH) == Fit(0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("away", "lost"),
+    [(0.0, False), (0.4, True)],
+    ids=["at the right place", "at a wrong one"],
+)
+def test_matches_that_agree_anywhere_neither_lose_a_sweep_nor_save_it(away, lost):
+    """As those of vineyard posts, which are looked for in one sweep and not in the next."""
+
+    def fits(away):
+        sure, vague = matches([away] * 7, [away] * 193), matches([0.9] * 1000, [], sigma=0.5)
+        both = replace(sure, edges=joined(sure.edges, vague.edges))
+        return [Fit.of(some, 1500, REACH) for some in (sure, both, vague)]
+
+    monitor = FitMonitor(RelocalizationConfig(memory=2))
+    for _ in range(2):
+        monitor.accept(fits(0.0)[1], gtsam.Pose3())
+    sure, both, vague = fits(away)
+    assert sure == both == Fit(200 / 1500, 0.0 if lost else 1.0)
+    assert monitor.misfit(sure) is monitor.misfit(both) is lost
+    assert vague == Fit(0.0, 0.0)
 
 
 def test_the_usual_is_the_median_of_what_went_into_the_map():
@@ -587,7 +616,7 @@ def test_a_sweep_that_jumped_and_fits_unusually_is_looked_for(before, calm, monk
     solution, monitor = frame.solve(before.solver), deepcopy(before.monitor)
     wrong = replace(solution, map_T_lidar=solution.map_T_lidar.retract([0, 0, 0.2, 0, 0, 0]))
     wrong = replace(wrong, matches=frame.matcher(wrong.map_T_lidar))
-    assert monitor.unusual(Fit.of(wrong.matches, frame.matcher.offered))
+    assert monitor.unusual(places_module.fit_of(frame.matcher, wrong))
     found = search(frame, wrong, monitor, before.solver, Doubt.JUMP)
     assert found.message.startswith("relocalised")
     assert found.solution.map_T_lidar.equals(solution.map_T_lidar, 1e-2)

@@ -705,7 +705,7 @@ def test_the_search_leaves_the_map_of_the_motion_that_it_chose(monkeypatch):
 
     def add(self, frame, found, *_):
         again = frame.matcher.moving_at(found.posed.twist)(found.solution.map_T_lidar)
-        shares.append([Fit.of(m, 1000).total for m in (found.solution.matches, again)])
+        shares.append([Fit.of(m, 1000, 1.0).total for m in (found.solution.matches, again)])
         return frame, found
 
     monkeypatch.setattr(first_sweeps.Start, "add", add)

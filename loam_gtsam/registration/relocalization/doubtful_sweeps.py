@@ -27,6 +27,7 @@ from loam_gtsam.registration.relocalization.fits import (
 from loam_gtsam.registration.relocalization.places import (
     any_of,
     contradicts,
+    fit_of,
     likely_places,
     moved,
     solved_near,
@@ -43,6 +44,7 @@ _BASIN = 0.5
 _TOLD = 3  # times that a sweep which fits with no expected motion tells one by itself
 _ANY = 1e3  # rad/s and m/s: standard deviation of a motion of which nothing is known
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
+_CONTRARY = "fits better as if no IMU had been there: one of the two is wrong"
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 
 
@@ -67,6 +69,11 @@ class Found:
     in_vain: bool = False  # whether it was looked for elsewhere, as it fits unusually little here
     searched: float = 0.0  # metres around, in which that was, if no acceleration leads here
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
+    contrary: str = ""  # sentence for the user if the sweep fits better without the IMU
+
+    def saying(self, otherwise: str) -> str:
+        """Its sentences for the user, with another one if it was not moved."""
+        return "; ".join(filter(None, (self.message or otherwise, self.contrary)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +101,7 @@ def doubtful(
         return None
     if monitor.lost or not solution.solved:
         return Doubt.MISFIT if monitor.lost else None
-    fit = Fit.of(solution.matches, frame.matcher.offered)
+    fit = fit_of(frame.matcher, solution)
     if monitor.misfit(fit):
         return Doubt.MISFIT
     seconds = moment.seconds_to(frame.sweep.stamp)
@@ -141,10 +148,7 @@ def second_opinion(
     solution = other.solve(solver)
     if not solution.solved:
         return frame, found
-    fit, before = (
-        Fit.of(solution.matches, matcher.offered),
-        Fit.of(found.solution.matches, m.offered),
-    )
+    fit, before = fit_of(matcher, solution), fit_of(m, found.solution)
     better = not found.solution.solved or fit.total > CLEARLY * before.total
     return (other, found_at(other, solution)) if better else (frame, found)
 
@@ -178,9 +182,10 @@ def placed(
         doubt = doubtful(frame, found.solution, monitor, last.twist)
     if imu is not None and frame is not given:
         imu.reject()
-    if doubt is not None:
-        return frame, search(frame, found.solution, monitor, solver, doubt)
-    return frame, found
+    place = found if doubt is None else search(frame, found.solution, monitor, solver, doubt)
+    if isinstance(place, Found) and frame.sweep.motion is not given.sweep.motion:
+        place = replace(place, contrary=_CONTRARY)
+    return frame, place
 
 
 def _solved(frame: Frame, solver: ScanSolver) -> Found:
@@ -200,7 +205,7 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
     pull = prior @ expected.map_T_lidar.localCoordinates(both.map_T_lidar)
     step = np.linalg.lstsq(beside.information, pull, rcond=None)[0]
     optimum = replace(beside, map_T_lidar=both.map_T_lidar.retract(step))
-    fits, best = (Fit.of(one.matches, matcher.offered).total for one in (both, alone))
+    fits, best = (fit_of(matcher, one).total for one in (both, alone))
     sigmas = np.concatenate([alone.matches.edges.sigmas, alone.matches.planes.sigmas])
     elsewhere = both.solved and _led(alone, both.map_T_lidar) > AGREE * np.median(sigmas)
     if not elsewhere or contradicts(expected, optimum) or fits < AS_WELL * best:
@@ -231,7 +236,7 @@ def search(
         matcher.clock.lap("relocalize")
         return _lost(frame, solution, monitor, solver) if found is None else found
     stays, found = found_at(frame, solution), None
-    if doubt is Doubt.OPTIMUM or monitor.unusual(Fit.of(solution.matches, matcher.offered)):
+    if doubt is Doubt.OPTIMUM or monitor.unusual(fit_of(matcher, solution)):
         found = _elsewhere(frame, solution, monitor, solver, stays)
         searched = monitor.radius if doubt is Doubt.JUMP else 0.0
         stays = replace(stays, in_vain=True, searched=searched)
@@ -257,12 +262,12 @@ def _as_before(
 def _lost(frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver) -> Lost:
     """The sweep, that fits nowhere, with its solution at the expected pose."""
     guess, usual = frame.predicted.map_T_middle, monitor.usual
-    before = Fit.of(solution.matches, frame.matcher.offered)
+    before = fit_of(frame.matcher, solution)
     nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
     further = ""
     if frame.priors:
         alone = replace(frame, lasting=(), since_last=()).solve(solver)
-        if alone.solved and monitor.fits_again(Fit.of(alone.matches, frame.matcher.offered)):
+        if alone.solved and monitor.fits_again(fit_of(frame.matcher, alone)):
             further = "; without the factors beside the scan, which contradict the map, it fits"
     return Lost(
         nowhere,
@@ -390,7 +395,7 @@ def _tried(
 ) -> tuple[Fit, Solution, PosedSweep]:
     """The sweep near a place, as it is de-skewed, and how it fits there."""
     found = solved_near(frame, matcher, place, solver)
-    return Fit.of(found.matches, matcher.offered), found, matcher.posed
+    return fit_of(matcher, found), found, matcher.posed
 
 
 def _by_own_motion(
@@ -421,7 +426,7 @@ def _by_own_motion(
 def accept(frame: Frame, found: Found, monitor: FitMonitor) -> None:
     """Tell the monitor of a sweep that goes into the map where it was found."""
     solution = found.solution
-    fit = Fit.of(solution.matches, frame.matcher.offered)
+    fit = fit_of(frame.matcher, solution)
     monitor.accept(fit, solution.map_T_lidar, found.led)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.planes import leaves_open
-from loam_gtsam.registration.relocalization.fits import AGREE, agreeing
+from loam_gtsam.registration.relocalization.fits import AGREE, agreeing, vague
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -54,22 +54,23 @@ class Evidence:
         signs, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
         hints: FloatArray | None = None
         if solution.solved:
-            vague = np.zeros(len(rows), np.bool_)
+            anywhere = np.zeros(len(rows), np.bool_)
             edges, planes = solution.matches.edges, solution.matches.planes
             lines = np.searchsorted(rows.edges, edges.indices)
             others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
-            reach, agree = matcher.matching.max_distance, agreeing(solution.matches)
-            for places, sure, sigmas in zip(
-                (lines, others), agree, (edges.sigmas, planes.sigmas), strict=True
+            reach = matcher.matching.max_distance
+            masks = agreeing(solution.matches), vague(solution.matches, reach)
+            for places, sigmas, sure, none in zip(
+                (lines, others), (edges.sigmas, planes.sigmas), *masks, strict=True
             ):
                 signs[places] = np.where(sure, 1.0, -_AGAINST)
                 if dense:
                     signs[places] *= 1.0 - np.minimum(AGREE * sigmas / reach, 1.0)
-                vague[places] = AGREE * sigmas >= reach
-            signs[vague] = 0.0
+                anywhere[places] = none
+            signs[anywhere] = 0.0
             axes[lines], axes[others] = edges.directions, planes.normals
             if not dense and leaves_open(planes, matcher.matching):
-                hints = vague.astype(np.float64)
+                hints = anywhere.astype(np.float64)
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)
         return cls(len(rows.edges), points, signs, axes, hints)

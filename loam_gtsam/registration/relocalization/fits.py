@@ -35,18 +35,25 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A measure of how well a sweep fits the map at a pose."""
+    """A measure of how well a sweep fits the map at a pose, by the matches that may disagree."""
 
     share: float  # of the features that are matched
     agreement: float  # share of the matches within three of their standard deviations
 
     @classmethod
-    def of(cls, matches: ScanMatches, offered: int) -> Fit:
-        """The fit of matches, from the number of features that were offered for matching."""
-        if not len(matches):
+    def of(cls, matches: ScanMatches, offered: int, reach: float) -> Fit:
+        """The fit of matches, from the number of features that were offered for matching.
+
+        Matches that agree anywhere within ``reach``, metres, do not count: they are no evidence,
+        and whether they are looked for at all may change from one sweep to the next.
+        """
+        told = [~mask for mask in vague(matches, reach)]
+        count = sum(int(np.count_nonzero(mask)) for mask in told)
+        if not count:
             return cls(0.0, 0.0)
-        agree = sum(int(np.count_nonzero(mask)) for mask in agreeing(matches))
-        return cls(len(matches) / max(offered, 1), agree / len(matches))
+        pairs = zip(agreeing(matches), told, strict=True)
+        agree = sum(int(np.count_nonzero(mask & may)) for mask, may in pairs)
+        return cls(count / max(offered, 1), agree / count)
 
     @property
     def total(self) -> float:
@@ -76,8 +83,17 @@ def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
     return lines, surfaces
 
 
+def vague(matches: ScanMatches, reach: float) -> tuple[BoolArray, BoolArray]:
+    """Masks of the line and of the plane matches that agree anywhere within so many metres."""
+    lines: BoolArray = AGREE * matches.edges.sigmas >= reach
+    surfaces: BoolArray = AGREE * matches.planes.sigmas >= reach
+    return lines, surfaces
+
+
 def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -> Fit:
     """Fit of edges and of planes that are not level, of so many features.
+
+    All matches count, as in the usual share of a keyframe and in the numbers of a frame.
 
     Level ground fits at any heading: with much of it, most matches of a wrong pose agree. Up is
     that of the lidar, for a map need not have one.
@@ -85,7 +101,8 @@ def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -
     up = map_T_lidar.rotation().matrix()[:, 2]
     standing = np.abs(matches.planes.normals @ up) < _LEVEL
     level = int(np.count_nonzero(~standing))
-    return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
+    upright = ScanMatches(matches.edges, subset(matches.planes, standing))
+    return Fit.of(upright, offered - level, np.inf)
 
 
 def same(one: gtsam.Pose3, other: gtsam.Pose3, apart: tuple[float, float] = APART) -> bool:

@@ -53,11 +53,16 @@ def likely_places(
     trial = replace(matcher, refine=False).with_few_matches()
     tried = [solved_near(frame, trial, start, solver) for start in starts]
     solved = _as_measured([one for one in tried if one.solved], frame.predicted.motion)
-    places = [(Fit.of(one.matches, trial.offered).total, one.map_T_lidar) for one in solved]
+    places = [(fit_of(trial, one).total, one.map_T_lidar) for one in solved]
     best = max((total for total, _ in places), default=0.0)
     as_good = [place for place in places if place[0] >= AS_WELL * best]
     ranks = [-total if monitor.lost else moved(points, expected, pose) for total, pose in as_good]
     return [as_good[number][1] for number in np.argsort(ranks, kind="stable")]
+
+
+def fit_of(matcher: FrameMatcher, solution: Solution) -> Fit:
+    """How well the features of a matcher fit the map where they were solved."""
+    return Fit.of(solution.matches, matcher.offered, matcher.matching.max_distance)
 
 
 def solved_near(

@@ -1,7 +1,7 @@
 """Errors of single beams of a lidar: what the residuals of the matches tell of them.
 
 A beam whose ranges are too long finds its points behind the walls that other beams have mapped, in
-whatever direction the wall lies. See docs/maths/covariance.md, "Beams".
+whatever direction the wall lies. See docs/maths/covariance.md, "Beams that disagree".
 """
 
 from __future__ import annotations

@@ -248,7 +248,7 @@ class _Sweep:
 
     def __init__(self, stamp, motion):
         self.stamp, self.motion, self.middle, self.duration = stamp, motion, 0.05, 0.1
-        self.acceleration = None
+        self.acceleration = self.ring_elevations = None
 
     def seconds(self, edges, planes):
         return np.zeros(len(edges)), np.zeros(len(planes))

@@ -172,7 +172,11 @@ def _in_order(section: type[Section], values: dict[str, Any]) -> dict[str, Any]:
 
 def _value(field: FieldInfo) -> st.SearchStrategy[Any]:
     if isinstance(field.default, tuple):
-        return st.tuples(*map(st.from_type, get_args(field.annotation)))
+        entries = get_args(field.annotation)
+        if Ellipsis in entries:  # rows, any number of them
+            row = st.tuples(*map(st.from_type, get_args(get_args(entries[0])[0])))
+            return st.lists(row, max_size=3).map(tuple)
+        return st.tuples(*map(st.from_type, entries))
     kinds = get_args(field.annotation) if field.default is None else ()
     one = next((kind for kind in kinds if kind is not type(None)), field.annotation)
     return st.from_type(Annotated[one, *field.metadata, ""])  # type: ignore[misc]

@@ -618,7 +618,7 @@ def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones() -> None:
 
 
 def test_a_run_whose_beams_disagree_writes_what_they_are_off_by() -> None:
-    spec = "sim:garage?frames=70&columns=450&seed=1&start=moving"
+    spec = "sim:garage?frames=55&columns=450&seed=1&start=moving"
     wrong = [
         [float(2 * beam - 15), (0.015 if beam % 2 else -0.015), 0.0, 0.0] for beam in range(16)
     ]
@@ -631,8 +631,6 @@ def test_a_run_whose_beams_disagree_writes_what_they_are_off_by() -> None:
     assert np.std(ranges) < 0.01  # of 15 mm
     refined = FinishedRun.read(Path("out"), open_dataset(spec))
     assert refined.config.sensor.beams == found
-    loam("run", spec, "--output", "out", "--overwrite", "--no-plot", "--set", "imu.coupling=off")
-    assert not Path("out/beams.yaml").exists()
 
 
 def test_a_run_is_refined_into_a_folder_of_its_own() -> None:

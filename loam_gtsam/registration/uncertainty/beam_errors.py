@@ -121,9 +121,7 @@ class BeamErrors:
         information, pull = np.zeros((3 * len(joined), 3 * len(joined))), np.zeros(3 * len(joined))
         information[np.ix_(rows, rows)], pull[rows] = self._information, self._pull
         self._elevations, self._information, self._pull = joined[order], information, pull
-        self._errors = np.zeros_like(pull)
-        if len(known):
-            self._errors = self._solved()
+        self._errors = self._solved()
 
     def _by_beam(
         self, points: FloatArray, normals: FloatArray, scales: FloatArray

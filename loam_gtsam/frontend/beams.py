@@ -51,12 +51,24 @@ def half_way(elevations: FloatArray) -> float:
     return 0.5 * float(np.median(np.diff(np.sort(elevations)))) if len(elevations) > 1 else np.inf
 
 
-def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> OrganisedSweep:
-    """The sweep without the errors of its beams; a ring that is none of ``beams`` stays as it is.
+def errors_at(elevations: FloatArray, beams: Sequence[BeamRow]) -> FloatArray:
+    """(R, 3) errors of range, elevation and azimuth of rings at (R,) elevations: metres, rad, rad.
 
-    A row has the elevation of a beam, degrees, by how much its ranges are too long, metres, and its
-    elevations and azimuths too large, degrees. It is for the ring with the nearest elevation, no
-    farther than half way to the next.
+    A row of ``beams`` has the elevation of a beam, degrees, by how much its ranges are too long,
+    metres, and its elevations and azimuths too large, degrees. It is for rings no farther from it
+    than half way to the next; others have no errors.
+    """
+    table = np.array(sorted(beams), np.float64).reshape(-1, 4)
+    if not len(table):
+        return np.zeros((len(elevations), 3))
+    away = np.abs(np.degrees(elevations)[:, None] - table[:, 0])
+    errors = table[away.argmin(axis=1), 1:]
+    errors[:, 1:] = np.radians(errors[:, 1:])
+    return np.where((away.min(axis=1) <= half_way(table[:, 0]))[:, None], errors, 0.0)
+
+
+def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> OrganisedSweep:
+    """The sweep without the :func:`errors <errors_at>` of its beams.
 
     Raises
     ------
@@ -71,12 +83,7 @@ def without_beam_errors(sweep: OrganisedSweep, beams: Sequence[BeamRow]) -> Orga
             "set sensor.rings, or leave sensor.beams out",
             SweepFault.BAD_RINGS,
         )
-    table = np.array(sorted(beams), np.float64)
-    elevations = np.degrees(elevations_of(sweep.xyz, sweep.ring_starts))
-    away = np.abs(elevations[:, None] - table[:, 0])
-    nearest = away.argmin(axis=1)
-    errors = np.where((away.min(axis=1) <= half_way(table[:, 0]))[:, None], table[nearest, 1:], 0.0)
-    errors[:, 1:] = np.radians(errors[:, 1:])
+    errors = errors_at(elevations_of(sweep.xyz, sweep.ring_starts), beams)
     each = np.repeat(errors, np.diff(sweep.ring_starts), axis=0)
     return replace(sweep, xyz=moved(sweep.xyz.T, -each).T.astype(np.float32))
 

@@ -9,7 +9,7 @@ import pytest
 
 from loam_gtsam import Config, SimulatedWorld, extract_features
 from loam_gtsam.config import dump_config, load_config
-from loam_gtsam.frontend.beams import Rays, elevations_of, moved, without_beam_errors
+from loam_gtsam.frontend.beams import Rays, elevations_of, errors_at, moved, without_beam_errors
 from loam_gtsam.frontend.organise import organise
 from loam_gtsam.types import ConfigError, FloatArray, Scan, SweepError
 
@@ -58,6 +58,16 @@ def test_a_ring_that_is_none_of_the_beams_stays_as_it_is() -> None:
     nearer = np.linalg.norm(sweep.xyz[:, :cut], axis=0) - np.linalg.norm(changed[:, :cut], axis=0)
     np.testing.assert_allclose(nearer, 0.05, atol=1e-5)
     assert without_beam_errors(sweep, ()) is sweep
+
+
+def test_errors_of_beams_are_for_elevations_within_half_way() -> None:
+    rows = [(2.0, 0.02, 0.0, 0.1), (0.0, 0.01, -0.1, 0.0), (4.0, 0.03, 0.0, 0.0)]
+    errors = errors_at(np.radians([-1.1, -0.9, 1.1, 4.0, 5.1]), rows)
+    errors[:, 1:] = np.degrees(errors[:, 1:])
+    none, first = (0.0, 0.0, 0.0), (0.01, -0.1, 0.0)
+    expected = [none, first, (0.02, 0.0, 0.1), (0.03, 0.0, 0.0), none]
+    np.testing.assert_allclose(errors, expected, atol=1e-12)
+    assert not errors_at(np.zeros(3), ()).any()
 
 
 def test_beams_need_rings() -> None:

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from loam_gtsam.config import Config
 from loam_gtsam.config.base import BeamRow
-from loam_gtsam.frontend.beams import Rays, half_way
+from loam_gtsam.frontend.beams import Rays, errors_at, half_way
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
@@ -190,12 +190,9 @@ class BeamErrors:
         if not any(self.believed):
             return self._removed
         errors = self._errors.reshape(-1, 3) * self.believed
-        table = np.column_stack((np.degrees(self._elevations), errors))
-        table[:, 2:] = np.degrees(table[:, 2:])
-        before = np.array(self._removed).reshape(-1, 4)
-        if len(before):
-            nearest = np.abs(table[:, :1] - before[:, 0]).argmin(axis=1)
-            table[:, 1:] += before[nearest, 1:]
+        errors = errors + errors_at(self._elevations, self._removed)
+        table = np.column_stack((self._elevations, errors))
+        table[:, [0, 2, 3]] = np.degrees(table[:, [0, 2, 3]])
         return tuple((row[0], row[1], row[2], row[3]) for row in np.round(table, 5).tolist())
 
     def as_dict(self) -> dict[str, list[Any] | str | None]:

@@ -101,9 +101,11 @@ class BagWriter(ClosingWriter):
         if self._writer is None:
             return
         with self._failing():
-            self._append(self._last_stamp, self._frames.path())
-            writer, self._writer = self._writer, None
-            writer.close()
+            try:
+                self._append(self._last_stamp, self._frames.path())
+            finally:
+                writer, self._writer = self._writer, None
+                writer.close()
             if self.frames:
                 self._give_name()
             _remove(self._active)

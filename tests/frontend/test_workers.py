@@ -16,8 +16,7 @@ from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.frontend.workers import extract, extract_ahead
 from loam_gtsam.types import BadSweep, DatasetError, Features, FrameStatus, Scan
 
-# Files that other tests have left open may be collected here.
-pytestmark = pytest.mark.filterwarnings("error", "ignore:unclosed file:ResourceWarning")
+pytestmark = pytest.mark.filterwarnings("error")
 
 
 @pytest.fixture(scope="module")

@@ -304,14 +304,17 @@ def test_an_earlier_bag_is_replaced_only_if_asked_and_when_complete(
     assert len(read(path)[ODOMETRY]) == 1
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cut_off_recording_is_kept_unless_overwritten(tmp_path: Path, name: str) -> None:
     BagWriter(tmp_path / name).write(make_update(0))
+    gc.collect()
     with pytest.raises(OutputError, match=rf"{name}\.active: a recording that was cut off"):
         BagWriter(tmp_path / name)
     assert len(read(write(tmp_path / name, 2, overwrite=True))[ODOMETRY]) == 2
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_forgotten_recording_does_not_spoil_the_one_that_replaces_it(
     tmp_path: Path, name: str

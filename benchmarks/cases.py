@@ -315,11 +315,11 @@ def judge(case: Case, outcome: CaseResult) -> Iterator[Verdict]:
     if case.ate_limit is not None:
         yield Verdict(f"ATE <= {case.ate_limit:g} m", outcome.ate <= case.ate_limit)
     if case.ate_share is not None:
-        met = outcome.ate < case.ate_share * outcome.path
-        yield Verdict(f"ATE < {100.0 * case.ate_share:g} % of the path", met)
+        short = outcome.ate < case.ate_share * outcome.path
+        yield Verdict(f"ATE < {100.0 * case.ate_share:g} % of the path", short)
     if case.ms_limit is not None:
-        met = outcome.stages["wall"][0] <= case.ms_limit
-        yield Verdict(f"<= {case.ms_limit:g} ms a frame", met)
+        fast = outcome.stages["wall"][0] <= case.ms_limit
+        yield Verdict(f"<= {case.ms_limit:g} ms a frame", fast)
     if case.ratio_limit is not None:
         met = None if np.isnan(outcome.ratio) else outcome.ratio <= case.ratio_limit
         yield Verdict(f"<= {case.ratio_limit:g} x KISS-ICP", met)

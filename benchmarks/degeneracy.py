@@ -19,6 +19,7 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.tables import markdown_table, write_rows
 from loam_gtsam.config import Config, preset
@@ -86,7 +87,7 @@ Policy = Callable[[Step], tuple[FloatArray, FloatArray]]
 
 def off(step: Step) -> tuple[FloatArray, FloatArray]:
     """Believe the scan."""
-    covariance = np.linalg.pinv(step.information, hermitian=True)
+    covariance = np.linalg.pinv(step.information, hermitian=True).astype(np.float64)
     return covariance @ step.right, covariance
 
 
@@ -94,7 +95,7 @@ def prior(step: Step) -> tuple[FloatArray, FloatArray]:
     """The expected pose as a factor along weak directions, the scan along the others."""
     keep = np.eye(6) - step.weak
     added = step.weak.T @ step.precision @ step.weak
-    covariance = np.linalg.inv(keep.T @ step.information @ keep + added)
+    covariance = np.linalg.inv(keep.T @ step.information @ keep + added).astype(np.float64)
     return covariance @ (keep.T @ step.right + added @ step.expected), covariance
 
 
@@ -275,7 +276,7 @@ def split(error: FloatArray, unseen: FloatArray, form: FloatArray) -> tuple[Floa
     return part, error - part
 
 
-def nees(error: FloatArray, covariance: FloatArray, basis: FloatArray) -> float:
+def nees(error: FloatArray, covariance: FloatArray, basis: NDArray[np.floating]) -> float:
     """Per direction of a basis (W, 6) of dual vectors; NaN if the covariance claims nothing."""
     if not len(basis):
         return float("nan")
@@ -314,7 +315,7 @@ def examine(
             error = guess.retract(step).localCoordinates(truth)
             parts = split(error, true, problem.form)
             metres = [float(np.sqrt(part @ problem.form @ part)) for part in parts]
-            ratios = (nees(error, covariance, dual) for dual in (along, across))
+            ratios = nees(error, covariance, along), nees(error, covariance, across)
             rows[policy.__name__].append((*metres, *ratios))
     return (
         [_detection(name, detector, len(place.unseen), hits[detector]) for detector in DETECTORS],

@@ -36,6 +36,7 @@ from loam_gtsam.datasets.sim.disturbances import (
     SectorDropouts,
 )
 from loam_gtsam.datasets.sim.scenes import BUILDERS
+from loam_gtsam.datasets.sim.streets import Scene
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.maps import SavedMap, localise, merge_maps, save_map
@@ -118,7 +119,7 @@ def measure(seed: int, most: int) -> Row:
 
 def _settings(rng: np.random.Generator) -> dict[str, Any]:
     """Some settings, each drawn or left as it is."""
-    drawn = {
+    drawn: dict[str, tuple[float, list[Any]]] = {
         "pose_graph.keyframe_distance": (1.0, [0.5, 1.0, 4.0]),
         "loops.enabled": (0.5, [True]),
         "imu.coupling": (0.5, ["tight", "loose", "off"]),
@@ -159,7 +160,7 @@ def _worlds(
         "max_range": float(rng.choice([15.0, 40.0, 100.0])),
     }
     frames = int(rng.integers(most // 2, most + 1))
-    places = scene, with_changes(BUILDERS[scene](number), changed, seed)
+    places: tuple[str | Scene, ...] = scene, with_changes(BUILDERS[scene](number), changed, seed)
     for count in (frames, frames // 2, frames // 4):
         try:
             return [
@@ -247,9 +248,9 @@ def _judged(
     beyond = 0
     for update in good:
         error = error_in_map(update, world, map_T_world)
-        beyond += error @ np.linalg.solve(update.covariance, error) > FIVE_SIGMA
+        beyond += bool(error @ np.linalg.solve(update.covariance, error) > FIVE_SIGMA)
     bad = sum(not _is_positive(update.covariance) for update in solved)
-    return _Judged(len(solved), len(good), int(beyond), bad)
+    return _Judged(len(solved), len(good), beyond, bad)
 
 
 def _is_positive(covariance: FloatArray) -> bool:

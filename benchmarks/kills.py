@@ -76,7 +76,7 @@ def main() -> None:
 def write_aided(path: Path, frames: int) -> None:
     """A bag with sweeps of the block, fixes of a receiver and poses of wheels."""
     sys.path.append(str(ROOT / "tests"))
-    from support import bags
+    from support import bags  # type: ignore[import-not-found]
 
     world, store = SimulatedWorld("street_loop", frames=frames, columns=450), bags.ROS1
     truth, recording = world.truth, []

@@ -128,10 +128,10 @@ class Round:
             rays = beams[:, column, ring].T
             parts = (rays, "f4"), (ranges[column, ring], "f4"), (column, "i2"), (ring, "i2")
             self._sweeps.append([np.ascontiguousarray(part, kind) for part, kind in parts])
-        poses = motion.world_T_lidar(0.1 * np.arange(self.frames))
+        poses = motion.world_T_lidar(np.arange(self.frames) * np.float64(0.1))
         self._truth = inverse_pose(poses[0]) @ poses
         stamps = np.arange(0, self.frames * _SWEEP, _SAMPLE)
-        self._samples = imu.samples(motion, stamps, stamps * 1e-9, 0)
+        self._samples = imu.samples(motion, stamps, (stamps * 1e-9).astype(np.float64), 0)
 
     def sweep(self, number: int) -> Scan:
         """The sweep of that number, counted from the start of the run."""

@@ -31,8 +31,9 @@ from benchmarks.soak_faults import KINDS, Expected, FaultyDrive
 from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.run_files import summarise
-from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
+from loam_gtsam.pipeline import Pipeline, effective_config
 from loam_gtsam.studies.evaluation import FIVE_SIGMA, absolute_error, squared_errors
 from loam_gtsam.types import (
     BoolArray,
@@ -70,10 +71,14 @@ _ROWS = 500
 """Of the CSV at most."""
 _POINT = 36e-6
 """MB of a map point, three doubles and a voxel key."""
-_NOTHING = {"information": np.zeros((6, 6)), "covariance": np.zeros((6, 6)), "uncertainty": None,
-            "localizability": np.zeros(6), "directions": np.zeros((6, 6)),
-            "direction_information": np.zeros(6), "axis_localizability": np.zeros(6),
-            "twist": np.zeros(6), "timings": {}}  # fmt: skip
+_NOTHING: dict[str, Any] = {
+    **{name: np.zeros((6, 6)) for name in ("information", "covariance", "directions")},
+    **dict.fromkeys(
+        ("localizability", "direction_information", "axis_localizability", "twist"), np.zeros(6)
+    ),
+    "uncertainty": None,
+    "timings": {},
+}
 """Of a frame's report what is not kept, in order to see the memory of the pipeline alone."""
 
 
@@ -166,7 +171,7 @@ def soak(scene: str, frames: int, seed: int = 0) -> SoakResult:
     kinds = tuple(kind for kind in KINDS if scene in SCENES or kind != _USABLE)
     drive = FaultyDrive(world, seed, kinds)
     config = effective_config(Config(), world)
-    pipeline = Pipeline(config, imu=imu_buffer(drive, config))
+    pipeline = Pipeline(config, imu=ImuBuffer(config.imu, drive.imu))
     updates: list[MapUpdate] = []
     numbers: list[int] = []
     exceptions: Counter[str] = Counter()
@@ -175,8 +180,8 @@ def soak(scene: str, frames: int, seed: int = 0) -> SoakResult:
     for sweep, number in drive.deliveries():
         try:
             update = pipeline.process(sweep)
-        except Exception as error:  # what must not happen is counted
-            exceptions[f"{type(error).__name__}: {error}"] += 1
+        except Exception as problem:  # what must not happen is counted
+            exceptions[f"{type(problem).__name__}: {problem}"] += 1
             continue
         updates.append(replace(update, **_NOTHING))
         numbers.append(number)

@@ -32,8 +32,8 @@ def _some(scan: Scan, chosen: BoolArray | IntArray) -> Scan:
     """The sweep with some of its points only."""
     assert scan.times is not None
     assert scan.rings is not None
-    points, times, rings = (part[chosen] for part in (scan.points, scan.times, scan.rings))
-    return replace(scan, points=points, times=times, rings=rings)
+    times, rings = scan.times[chosen], scan.rings[chosen]
+    return replace(scan, points=scan.points[chosen], times=times, rings=rings)
 
 
 def _thin(scan: Scan, rng: Rng, points: int) -> Scan:
@@ -58,7 +58,7 @@ SPOILT: Mapping[str, tuple[str, Callable[[Scan, Rng], Sweep]]] = {
     "sixty points": ("no_features", lambda scan, rng: _thin(scan, rng, 60)),
     "point times in nanoseconds": (
         "bad_times",
-        lambda scan, rng: replace(scan, times=scan.times * 1e9),  # type: ignore[operator]
+        lambda scan, rng: replace(scan, times=scan.times * 1e9),  # type: ignore[arg-type, operator]
     ),
     "all points on one ring": (
         "bad_rings",

@@ -145,8 +145,8 @@ class PartError(LoamError):
     Attributes
     ----------
     part : the name of the part: ``solver``, ``extra_factors``, ``priors`` of a sweep,
-        ``loop_closer``, ``odometry``, ``features``, ``observe``, ``on_frame``, or ``graph`` for
-        factors in the pose graph
+        ``loop_closer``, ``odometry``, ``features``, ``observe``, ``on_frame``, ``graph`` for
+        factors in the pose graph, or ``factors`` for those of ``refine``
     indeterminate : whether GTSAM found a linear system that does not determine its variables
     """
 

@@ -260,7 +260,8 @@ class OtherFactors:
     def error(self, poses: FloatArray) -> float:
         """Cost of the factors."""
         values = _values(poses, self._first)
-        total = 0.0 if not self.graph.size() else float(self.graph.error(values))
+        with own_code("factors", "one of them"):
+            total = 0.0 if not self.graph.size() else float(self.graph.error(values))
         if self._anchor is not None:
             off = gtsam.Pose3.Logmap(self._anchor.between(gtsam.Pose3(poses[0])))
             total += 0.5 * float(off @ off) / _ANCHOR**2
@@ -271,7 +272,8 @@ class OtherFactors:
         parts = [(ties.numbers, *ties.equations(poses)) for ties in self.known]
         values = _values(poses, self._first)
         for place in range(self.graph.size()):
-            linear: Any = self.graph.at(place).linearize(values)
+            with own_code("factors", f"factor {place}"):
+                linear: Any = self.graph.at(place).linearize(values)
             if linear is None:
                 continue
             keys = linear.keys()

@@ -16,7 +16,7 @@ from loam_gtsam.refine.elimination import eliminated, refitted, sightings
 from loam_gtsam.refine.landmarks import find_landmarks, voxel_sizes
 from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.motion_factors import told_directions
-from loam_gtsam.refine.rounds import Settings
+from loam_gtsam.refine.rounds import Settings, check_factors
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
 from loam_gtsam.registration.uncertainty import relative_covariance
@@ -402,4 +402,24 @@ def test_a_faulty_factor_of_ones_own_is_refused(residual, error) -> None:
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
     factors.add(checked_factor(noise, [gtsam.symbol("x", 1)], residual))
     with pytest.raises(error, match="factors"):
+        refine(sweeps, poses, factors)
+
+
+@pytest.mark.parametrize("calls", [1, 3])
+def test_a_factor_of_ones_own_that_fails_on_the_way_is_named(calls) -> None:
+    sweeps, _, poses = _scene(edges=_posts)
+    factors, seen = gtsam.NonlinearFactorGraph(), []
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+
+    def residual(values):
+        seen.append(values)
+        if len(seen) > checked + calls:
+            raise ZeroDivisionError("late")
+        return np.zeros(3), [np.eye(3, 6)]
+
+    factors.add(checked_factor(noise, [gtsam.symbol("x", 1)], residual))
+    checked = np.inf
+    check_factors(factors, poses)
+    checked = len(seen)
+    with pytest.raises(PartError, match=r"factors of your own .* raised ZeroDivisionError: late"):
         refine(sweeps, poses, factors)

@@ -262,10 +262,8 @@ class Mapper:
         self, predicted: Prediction, priors: Sequence[gtsam.NonlinearFactor], clock: Clock
     ) -> Frame:
         """What the solve starts from: matches, the caller's factors, the IMU's and the user's."""
-        stamp, own = predicted.posed.sweep.stamp, OwnFactors()
-        if self.extra_factors is not None and self._moment is not None:
-            context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
-            own = own_factors(self.extra_factors, context, self._moment.error)
+        stamp, known = predicted.posed.sweep.stamp, (self._moment, self.config.solver)
+        predicted, own = _beside_own(predicted, priors, self.extra_factors, *known)
         factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
         matcher = FrameMatcher.of(
@@ -281,7 +279,8 @@ class Mapper:
             self.start = None if self.start.complete else self.start
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         accept(frame, found, self.monitor)
-        scan = self.errors.of_scan(solution, posed.sweep, small=self.maps.small)
+        between = self._named.told(frame.since_last, solution.map_T_lidar)
+        scan = self.errors.of_scan(solution, posed.sweep, between, small=self.maps.small)
         told = self.imu, posed, frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, said, more = with_imu(*told)
@@ -324,6 +323,23 @@ class Mapper:
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
         return make_update(posed, map_T_lidar, status, message, solution, tilt)
+
+
+def _beside_own(
+    predicted: Prediction, priors: Sequence[gtsam.NonlinearFactor], extra: ExtraFactors | None,
+    last: Moment | None, config: SolverConfig,
+) -> tuple[Prediction, OwnFactors]:  # fmt: skip
+    """The prediction beside a user's factors, and those that ``extra`` gives; no more if none."""
+    own, stamp = OwnFactors(), predicted.posed.sweep.stamp
+    if last is None:
+        return predicted, own
+    if extra is not None:
+        context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, last[:2])
+        own = own_factors(extra, context, last.error)
+    if priors or any(own):
+        motion = predicted.motion.of_any_velocity(last.seconds_to(stamp), config)
+        predicted = replace(predicted, motion=motion)
+    return predicted, own
 
 
 def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:

@@ -19,7 +19,7 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.registration.solvers.own_factors import LAST_KEY, PoseContext, own_factors
-from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.studies.evaluation import absolute_error, nees
 from loam_gtsam.types import Features, FrameStatus, InputError
 
 LAST = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.2, 0.1), np.array([3.0, -1.0, 0.5]))
@@ -140,6 +140,38 @@ def test_wheels_hold_the_pose_along_a_hall_without_ends():
         found.append(update.map_T_lidar.x())
     assert found[0] < 0.75
     assert found[1] == pytest.approx(1.5, abs=0.05)
+
+
+def positions(world, context, sigma, rng):
+    """Of a receiver."""
+    here = world.truth_at(np.array([context.middle_stamp]))[0].translation()
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+    return [gtsam.GPSFactor(context.key, here + rng.normal(0.0, sigma, 3), noise)]
+
+
+def steps(world, context, sigma, rng):
+    """Of an odometry that drifts."""
+    last, now = world.truth_at(np.array([context.last[0], context.middle_stamp]))
+    sigmas = np.repeat([0.01, sigma], 3)
+    step = last.between(now).retract(rng.normal(0.0, sigmas))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    return [gtsam.BetweenFactorPose3(context.last_key, context.key, step, noise)]
+
+
+@pytest.mark.parametrize(("make", "sigma", "grows"), [(positions, 0.1, False), (steps, 0.02, True)])
+def test_where_the_scan_is_blind_own_factors_decide(make, sigma, grows):
+    """And not the velocity, which the poses before have told: it kept the run where it began."""
+    world = SimulatedWorld("corridor_bare", frames=40, columns=240, max_range=6.0)
+    rng = np.random.default_rng(5)
+    without = Config().changed("imu.coupling=off")
+    result = run(world, without, extra_factors=lambda context: make(world, context, sigma, rng))
+    assert world.truth.positions[-1, 0] > 10.0
+    found = nees(result.updates, world.truth)
+    assert len(found.beyond) == 0
+    assert 0.2 < found.mean < 2.0
+    told = [np.sqrt(update.covariance[3, 3]) for update in result.updates]
+    expected = sigma * (np.sqrt(len(told)) if grows else 1.0)
+    assert 0.7 * expected < told[-1] < 2.0 * expected
 
 
 def test_a_height_in_a_corridor_leaves_the_way_along_it_alone():

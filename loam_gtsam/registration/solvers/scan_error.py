@@ -13,7 +13,7 @@ from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.geometry import nearest_positive, symmetric, transform, voxel_keys
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers.base import SCAN_VARIANCE, Solution, linearized
+from loam_gtsam.registration.solvers.base import SCAN_VARIANCE, MotionPrior, Solution, linearized
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 from loam_gtsam.types import FloatArray, IntArray
@@ -33,7 +33,8 @@ class ScanError:
     ----------
     covariance : (6, 6) of the pose if the map were exact
     renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time
-    user : (6, 6) share of the pose that factors beside the scan decide
+    user : (6, 6) share of the pose that factors beside the scan decide, those since the last pose
+        only where the scan helps
     expected : (6, 6) share of the pose that the expected motion decides
     raw : (6, 6) raw covariance of what scan and other factors decide
     information : (6, 6) of the scan alone, for other factors; none along degenerate directions
@@ -45,6 +46,8 @@ class ScanError:
         before, moves the pose, rad and m per metre
     offset : metres that they are too long, by the residuals of this scan
     offset_information : of that number, 1 / m^2, as far as it is none of scans before
+    since_last : (6, 6) part of ``covariance`` that stems from factors since the last pose, along
+        degenerate directions: the poses to come have it, too
     """
 
     covariance: FloatArray
@@ -61,6 +64,7 @@ class ScanError:
     by_offset: FloatArray = field(default_factory=partial(np.zeros, 6))
     offset: float = 0.0
     offset_information: float = 0.0
+    since_last: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
 
     def seen(self, weak: FloatArray | None) -> FloatArray:
         """(6, 6) the part of ``covariance`` across the degenerate directions, a projector."""
@@ -116,6 +120,7 @@ class ScanError:
 def scan_error(
     solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
     *, kernel: str = "huber", with_priors: bool = True, seconds: FloatArray | None = None,
+    between: MotionPrior | None = None,
 ) -> ScanError | None:  # fmt: skip
     """The error of one solved frame from its residuals; None if its information is singular.
 
@@ -133,10 +138,13 @@ def scan_error(
     with_priors : whether ``solution.information`` counts priors beside the matches
     seconds : (R,) from the middle of the sweep to the points of the rows, two an edge and one a
         plane; None if all are of one time
+    between : what factors between the last pose and this one tell, which the solution counts among
+        its priors; None without any
     """
     pose, lines = solution.map_T_lidar, 2 * len(solution.matches.edges)
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
-    keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
+    weak = np.zeros((6, 6)) if solution.weak is None else solution.weak
+    keep = np.eye(6) - weak
     residuals, jacobian = _as_solved(solution, rows, keep)
     points = transform(pose.matrix(), rows.points)
     information: FloatArray = jacobian.T @ jacobian
@@ -146,7 +154,6 @@ def scan_error(
         total = total + expected
     priors = nearest_positive(total - information)
     if expected is None:  # of a solver that does not say: all priors along weak directions
-        weak = np.eye(6) - keep
         expected = weak.T @ priors @ weak
     if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
@@ -177,7 +184,7 @@ def scan_error(
     step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
     parts = meat + priors, renewed, total - expected
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
-    shares = bread @ keep.T @ priors @ keep, bread @ expected
+    shares, since_last = _shares(bread, priors, expected, weak, between)
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
     times = np.zeros(len(residuals)) if seconds is None else seconds
     by_velocity, by_acceleration = (
@@ -191,7 +198,22 @@ def scan_error(
     seen.add(pose.AdjointMap() @ moved)
     known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
     ways = by_velocity, by_acceleration, moved
-    return ScanError(*found, *scattered, *ways, offset, known)
+    return ScanError(*found, *scattered, *ways, offset, known, since_last)
+
+
+def _shares(
+    bread: FloatArray, priors: FloatArray, expected: FloatArray, weak: FloatArray,
+    between: MotionPrior | None,
+) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:  # fmt: skip
+    """``user`` and ``expected``, and ``since_last`` of a :class:`ScanError`.
+
+    ``bread`` (6, 6) is the covariance of the solution, ``priors`` the information of all but the
+    matches, the ``expected`` motion's included, and ``weak`` the projector on what is degenerate.
+    """
+    keep, since = np.eye(6) - weak, np.zeros((6, 6)) if between is None else between.information
+    others = keep.T @ priors @ keep + weak.T @ (priors - expected - since) @ weak
+    lasting = weak @ bread @ since @ bread @ weak.T
+    return (bread @ others, bread @ expected), symmetric(lasting)
 
 
 def _as_solved(

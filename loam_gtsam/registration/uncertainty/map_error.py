@@ -115,7 +115,7 @@ class MapError:
         before = last.map_T_lidar if last is not None and self._follows(last) else None
         found = before, solution.map_T_lidar, share, scan.raw
         step = self._velocity.observe(sweep.stamp, *found, turned=rotation_is_known(sweep))
-        by_chance = renewed + step.by_chance
+        by_chance = renewed + step.by_chance + scan.since_last
         if seen is not None:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance
             by_chance = by_chance + rows * seen.wander(moved)

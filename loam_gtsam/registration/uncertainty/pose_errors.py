@@ -131,11 +131,13 @@ class PoseErrors:
         return self._map.expected(stamp, last, imu)
 
     def of_scan(
-        self, solution: Solution, sweep: MovingSweep, *, small: bool = False
-    ) -> ScanError | None:
+        self, solution: Solution, sweep: MovingSweep, between: MotionPrior | None = None,
+        *, small: bool = False,
+    ) -> ScanError | None:  # fmt: skip
         """The error of a solved sweep; to be called once for each, in order.
 
-        ``small`` tells whether the place is small.
+        ``between`` is what a user's factors between the last pose and this one tell; ``small``
+        tells whether the place is small.
         """
         self._scans += 1
         config, seen = self._places[small], self._seen
@@ -149,6 +151,7 @@ class PoseErrors:
         return scan_error(
             solution, self._kernel_width, seen, config, kernel=self._kernel,
             with_priors=self._with_priors, seconds=row_seconds(solution.matches, sweep),
+            between=between,
         )  # fmt: skip
 
     def calibrated(

@@ -91,6 +91,15 @@ def are_two_numbers(value: object) -> bool:
     return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
 
 
+def check_unmasked(value: object, name: str) -> None:
+    """InputError for an array of ``numpy.ma``, whose mask would be lost."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise InputError(
+            f"{name}: expected an array without a mask, got a numpy.ma.MaskedArray; leave out what "
+            "is masked, or give .filled(np.nan) where NaN is allowed"
+        )
+
+
 def check_array(
     value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
 ) -> None:
@@ -99,6 +108,7 @@ def check_array(
     A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
     integers or floats, the array must hold these.
     """
+    check_unmasked(value, name)
     kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
     got = type(value).__name__
     if isinstance(value, np.ndarray):
@@ -114,6 +124,7 @@ def check_array(
 
 def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
     """(N,) int64 nanoseconds; InputError for anything but integers."""
+    check_unmasked(value, name)
     try:
         stamps = np.asarray(value)
     except ValueError as error:

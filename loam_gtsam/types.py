@@ -267,9 +267,9 @@ class ImuSamples:
         if self.orientation is None:
             del columns["orientation"]
         for name, width in columns.items():
-            column = np.asarray(getattr(self, name))
+            column = np.asanyarray(getattr(self, name))
             check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
-            object.__setattr__(self, name, column)
+            object.__setattr__(self, name, np.asarray(column))
 
 
 class FrameStatus(StrEnum):

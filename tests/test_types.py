@@ -28,6 +28,7 @@ def features_at(stamp):
     [
         ({"points": np.zeros((6, 4))}, r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)"),
         ({"points": np.zeros(3)}, r"Scan.points.*\(3,\)"),
+        ({"points": np.ma.array(np.zeros((6, 3)))}, r"Scan.points: .*without a mask.*filled"),
         ({"points": "cloud"}, "Scan.points.*str"),
         ({"points": np.zeros((6, 4))}, r"Scan.points: .*; \[:, :3\] takes the first three columns"),
         ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected .* floats, got .*int64"),
@@ -70,6 +71,8 @@ def test_a_scan_takes_what_fits():
         ({"stamps": np.zeros(6)}, r"ImuSamples.stamps: expected .*seconds \* 1e9"),
         ({"orientation": np.zeros((6, 3))}, r"ImuSamples.orientation: expected \(6, 4\)"),
         ({"gyro": None}, r"ImuSamples.gyro: expected \(6, 3\) numbers"),
+        ({"gyro": np.ma.array(np.zeros((6, 3)))}, r"ImuSamples.gyro: expected .* without a mask"),
+        ({"stamps": np.ma.array(np.arange(6))}, r"ImuSamples.stamps: expected .* without a mask"),
         ({"acceleration": np.zeros(6)}, r"ImuSamples.acceleration: expected \(6, 3\)"),
     ],
 )

@@ -147,6 +147,11 @@ class FinishedRun:
         stamps = [update.stamp for update in frames]
         as_run = Trajectory.from_poses(stamps, (update.map_T_lidar for update in frames))
         if not (self.folder / LOOP_FILES[1]).exists():
+            if summary_in(self.folder).get("loops") is not None:
+                raise DatasetError(
+                    f"{self.folder}: expected {LOOP_FILES[1]}, for the run had loops; write_graph "
+                    "writes it beside the files of write_run"
+                )
             return as_run
         corrected = read_truth(self.folder / "trajectory.tum")
         if len(corrected) != len(as_run):

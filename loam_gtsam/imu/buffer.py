@@ -179,7 +179,7 @@ class ImuBuffer:
         """The same samples, those to come as well, with a bias that others do not change."""
         return copy(self)
 
-    def remember(self) -> Callable[[], None]:
+    def restorer(self) -> Callable[[], None]:
         """A function that brings the bias back; samples do not depend on the frames."""
         return partial(setattr, self, "_bias", self._bias)
 

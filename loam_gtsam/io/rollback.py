@@ -41,7 +41,7 @@ def whole(method: Callable[Concatenate[_S, _P], _R]) -> Callable[Concatenate[_S,
 class Before:
     """The state of an object, and of all that belongs to it, at a moment.
 
-    Followed are containers and objects of this package. An object that has a method ``remember()``
+    Followed are containers and objects of this package. An object that has a method ``restorer()``
     is asked instead; it returns a function that brings the object back. Objects of a user, frozen
     ones, arrays and those of GTSAM are taken not to change, but for values and graphs of factors.
     """
@@ -131,7 +131,7 @@ def _object(slots: list[str], value: Any) -> tuple[_Restore, list[Any]]:
 
 
 def _asked(value: Any) -> tuple[_Restore, list[Any]]:
-    return value.remember(), []
+    return value.restorer(), []
 
 
 _HOW: dict[type, _How | None] = {
@@ -157,7 +157,7 @@ def _choose(kind: type) -> _How | None:
         return _tuple
     if kind.__module__.partition(".")[0] != _PACKAGE or issubclass(kind, (Enum, Section, type)):
         return None
-    if hasattr(kind, "remember"):
+    if hasattr(kind, "restorer"):
         return _asked
     frozen: Any = getattr(kind, "__dataclass_params__", None) if is_dataclass(kind) else None
     return None if frozen is not None and frozen.frozen else partial(_object, _slots(kind))

@@ -45,7 +45,7 @@ class IncrementalGraph:
         self._before: dict[str, Any] | None = None
         self._is_watched = False
 
-    def remember(self) -> Callable[[], None]:
+    def restorer(self) -> Callable[[], None]:
         """A function that brings the graph back to what it is now.
 
         A copy takes 20 microseconds a keyframe, so it is made by the first change.

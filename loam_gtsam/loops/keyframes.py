@@ -86,7 +86,7 @@ class Journal:
     def __init__(self) -> None:
         self.all: list[Forgotten] = []
 
-    def remember(self) -> Callable[[], None]:
+    def restorer(self) -> Callable[[], None]:
         """A function that brings the journal back to what it is now."""
         size = len(self.all)
 

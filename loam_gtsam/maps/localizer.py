@@ -106,6 +106,11 @@ class Localizer:
                 f"{saved.path}: the map has no places at which it can be recognised: its run was "
                 "too short, or never solved; map more of the place"
             )
+        if parts.get("loop_closer") is not None:
+            raise InputError(
+                "loop_closer: no loops are closed in a map that stays as it is; leave it out, or "
+                "map with run(..., loop_closer=...) and merge the maps"
+            )
         self.config = config_in(saved, config, extend=extend)
         self._saved, self._parts = saved, parts
         self._extend, self._inside = extend, inside

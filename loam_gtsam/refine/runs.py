@@ -28,6 +28,7 @@ from loam_gtsam.refine.sweeps import (
     Path,
     ReferenceSteps,
     SweepPoints,
+    check_placed,
     extract_points,
     path_starts,
 )
@@ -96,6 +97,7 @@ def run_points(
     frames: list[int] = []
     used: list[SweepPoints] = []
     held: list[SweepPoints] = []
+    check_placed(updates)
     sweeps = sweeps_of_run(dataset, len(updates))
     for number, (sweep, update) in enumerate(zip(sweeps, updates, strict=True)):
         if on_sweep is not None:

@@ -23,8 +23,10 @@ from loam_gtsam.types import (
     Features,
     FeatureSweep,
     FloatArray,
+    FrameStatus,
     InputError,
     IntArray,
+    MapUpdate,
     Scan,
     Sweep,
 )
@@ -236,6 +238,19 @@ class Path:
         """``map_T_lidar`` so many seconds from the middle of a sweep."""
         step = self.motion(number, np.array([seconds]))[0]
         return gtsam.Pose3(self.map_T_middle[number]).compose(gtsam.Pose3.Expmap(step))
+
+
+def check_placed(updates: Sequence[MapUpdate]) -> None:
+    """InputError for frames whose poses mean nothing: none was solved, or the first are lost."""
+    solved = [number for number, update in enumerate(updates) if update.status.solved]
+    begins = any(update.status is FrameStatus.FIRST for update in updates)
+    if not solved and len(updates) > 1:
+        raise InputError(f"updates: expected frames that were solved, got none of {len(updates)}")
+    if solved and not begins and any(not one.status.solved for one in updates[: solved[0]]):
+        raise InputError(
+            f"updates: the first {solved[0]} frames were not found in a map (localise), and their "
+            f"poses mean nothing; give dataset.part({solved[0]}) and updates[{solved[0]}:]"
+        )
 
 
 def path_starts(found: Sequence[BoolArray]) -> list[int]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.aiding import aids_of
 from loam_gtsam.errors import check_count, check_kind
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
@@ -224,7 +225,8 @@ def _make_runners(
             imu = imu_buffer(dataset, config)
             # A guess that is shared takes the place of the contender's own odometry.
             parts = cast(Parts, dict(entry.parts) | ({} if guess is None else {"odometry": guess}))
-            pipeline = Pipeline(config, imu=imu, **parts)
+            fixes, wheels = aids_of(dataset, config)
+            pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
             priors.append(pipeline.config.imu.prior)
             if imu is not None and priors[-1] != priors[0]:
                 notes.append(
@@ -234,7 +236,7 @@ def _make_runners(
             if shared_guess and guess is None:
                 steady = ConstantVelocity(pipeline.mapper.imu)
                 pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)
-            runners.append(PipelineRunner(entry, pipeline, features))
+            runners.append(PipelineRunner(entry, pipeline, features, fixes))
         stack.callback(runners[-1].close)
     return runners, notes
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, SolverConfig, load_config, preset
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.errors import nearest
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
@@ -316,8 +317,12 @@ class PipelineRunner:
     Pipeline and IMU buffer are for this contender alone: the buffer learns the gyro's bias.
     """
 
-    def __init__(self, contender: Contender, pipeline: Pipeline, features: SharedFeatures) -> None:
+    def __init__(
+        self, contender: Contender, pipeline: Pipeline, features: SharedFeatures,
+        fixes: GnssFixes | None = None,
+    ) -> None:  # fmt: skip
         self.contender, self.pipeline, self._features = contender, pipeline, features
+        self._fixes = fixes
         self.updates: list[MapUpdate] = []
 
     def register(self, sweep: Sweep) -> None:
@@ -327,6 +332,8 @@ class PipelineRunner:
 
     def result(self, frames: int) -> SolverRun:
         """The run over the first ``frames`` sweeps."""
+        if self._fixes is not None:
+            self.pipeline.tie_to_earth(self.updates[:frames], self._fixes)
         whole = self.pipeline.result(self.updates[:frames])
         return SolverRun.of_result(self.contender.name, whole, self.contender.group)
 

@@ -18,7 +18,15 @@ from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.geometry import five_sigma, inverse_pose, transform
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.trajectory import check_increasing
-from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
+from loam_gtsam.types import (
+    FloatArray,
+    FrameStatus,
+    InputError,
+    IntArray,
+    MapUpdate,
+    Trajectory,
+    check_kind,
+)
 
 _NO_SPREAD = 1e-9
 """Ratio of the second to the first singular value below which positions lie on a line (the ratio
@@ -270,7 +278,8 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
         here
     reference : interpolated at the stamps of the updates
     window : motions over so many frames, with :func:`~loam_gtsam.relative_covariance`; 0 for poses
-        since the first frame inside the reference, with ``MapUpdate.covariance``
+        since the first frame inside the reference, with ``MapUpdate.covariance``; what is lost
+        before the first fix of a localisation is left out
 
     Raises
     ------
@@ -285,6 +294,9 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     inside = [n for n, u in enumerate(updates) if u.status.has_pose and first <= u.stamp <= last]
     if not inside:
         raise InputError(f"nees: expected poses inside {first} to {last} ns, got none")
+    begun = FrameStatus.FIRST, *(status for status in FrameStatus if status.solved)
+    placed = [n for n in inside if updates[n].status in begun]  # none before the fix of localise
+    inside = [n for n in inside if not placed or n >= placed[0]]
     chosen = [updates[n] for n in inside]
     truth = reference.at([update.stamp for update in chosen])
     _need_orientation("nees", truth.map_T_lidar)

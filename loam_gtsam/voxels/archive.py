@@ -85,7 +85,7 @@ class Archive:
             copy.store(index, content)
         return copy
 
-    def remember(self) -> Callable[[], None]:
+    def restorer(self) -> Callable[[], None]:
         """A function that brings the archive back to what it is now, until this is called again."""
         for path in self._stale or ():
             path.unlink(missing_ok=True)

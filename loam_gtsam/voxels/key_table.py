@@ -42,7 +42,7 @@ class KeyTable:
     def _set(self, merged: Columns, waiting: Columns) -> None:
         self._merged, self._waiting = merged, waiting
 
-    def remember(self) -> Callable[[], None]:
+    def restorer(self) -> Callable[[], None]:
         """A function that brings the table back to what it is now: no array changes in place."""
         return partial(self._set, self._merged, self._waiting)
 

@@ -9,6 +9,8 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.decode.aiding import WheelSamples
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
+from loam_gtsam.studies.comparison import compare_solvers
+from loam_gtsam.studies.contenders import Contender
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import ConfigError, DatasetError, InputError
 
@@ -50,6 +52,14 @@ def test_in_a_bare_tunnel_the_wheels_say_how_far(tunnel):
     assert error.maximum < 0.02 * tunnel.truth.path_length
     # The scans do not see it still, and the covariance says so.
     assert result.status_counts["degenerate"] > 30
+
+
+def test_a_comparison_has_the_wheels_that_a_run_has(tunnel):
+    config = OFF.changed(aiding=MOUNTED)
+    dataset = ArrayDataset(list(tunnel)[:12], wheels=planar(tunnel), sensor=tunnel.sensor)
+    compared = compare_solvers(dataset, [Contender("wheels", config)]).runs[0].trajectory
+    expected = run(dataset, config).trajectory
+    np.testing.assert_array_equal(compared.map_T_lidar, expected.map_T_lidar)
 
 
 def test_wheels_that_contradict_the_scans_are_not_believed():

@@ -60,7 +60,7 @@ def test_a_pose_graph_is_brought_back_and_goes_on_to_the_same_bits():
     for graph in graphs:
         for number in range(4):
             add(graph, number)
-    back = graphs[1].remember()
+    back = graphs[1].restorer()
     add(graphs[1], 4)
     back()
     assert graphs[1].values.size() == graphs[1].factors.size() == 4

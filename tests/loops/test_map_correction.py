@@ -8,14 +8,14 @@ import pytest
 from support.quick import PREDICTED
 from support.worlds import OWN, World, there_and_back, updates
 
-from loam_gtsam.config import Config
-from loam_gtsam.datasets import open_dataset
+from loam_gtsam.config import Config, preset
+from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.map_graph import graph_arrays, graph_of, graph_of_arrays
-from loam_gtsam.pipeline import Pipeline, imu_buffer
+from loam_gtsam.pipeline import Pipeline, imu_buffer, run
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.registration.uncertainty import PoseErrors
@@ -337,6 +337,19 @@ def test_a_place_that_is_visited_again_and_again_takes_no_more_room():
         some.graph.pose(100)
     steps = len(some.graph._graph.__getstate__())
     assert steps <= 4 * (counts["keyframes"] + counts["loops"]) + 101
+
+
+@pytest.mark.parametrize("name", ["loam", "aloam"])
+def test_a_loop_closer_of_ones_own_goes_with_the_odometry_of_a_preset(name):
+    """Which has a public method ``remember``, as what rolls a failed sweep back once had."""
+
+    class Closer:
+        def detect(self, keyframe, history):
+            return None
+
+    result = run(SimulatedWorld("room", frames=3, columns=300), preset(name), loop_closer=Closer())
+    assert len(result.updates) == 3
+    assert result.loops is not None
 
 
 def test_odometry_back_to_a_known_place_is_no_loop():

@@ -480,6 +480,11 @@ def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):
         localise(mapped.world, saved, config)
 
 
+def test_a_loop_closer_has_nothing_to_close_in_a_map(saved):
+    with pytest.raises(InputError, match="loop_closer: no loops are closed in a map"):
+        Localizer(saved, loop_closer=object())
+
+
 def test_a_map_without_places_is_refused(tmp_path):
     """As that of a run of which no frame was sure; it can be opened, for its points."""
     path = tmp_path / "none.lgmap"

@@ -20,7 +20,14 @@ from loam_gtsam.refine.rounds import Settings, check_factors
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
 from loam_gtsam.registration.uncertainty import relative_covariance
-from loam_gtsam.types import DatasetError, FeatureSweep, InputError, PartError, Trajectory
+from loam_gtsam.types import (
+    DatasetError,
+    FeatureSweep,
+    FrameStatus,
+    InputError,
+    PartError,
+    Trajectory,
+)
 
 SIZES = voxel_sizes(3.2, 0.4)
 SECOND = 1_000_000_000
@@ -386,6 +393,17 @@ def test_the_data_set_of_another_run_is_refused(room) -> None:
     other = Trajectory.from_poses([1, 2, 3], [gtsam.Pose3()] * 3)
     with pytest.raises(InputError, match="stamps of the run's poses"):
         refine_run(points, result.updates[:3], trajectory=other)
+
+
+def test_poses_that_mean_nothing_are_refused(room) -> None:
+    world, result, _ = room
+    updates = [*result.updates]
+    lost = [replace(update, status=FrameStatus.LOST) for update in updates[:3]]
+    with pytest.raises(InputError, match=r"the first 3 frames .* dataset\.part\(3\)"):
+        run_points(world, [*lost, *updates[3:]], result.config)
+    sparse = [replace(update, status=FrameStatus.SPARSE_MAP) for update in updates[1:]]
+    with pytest.raises(InputError, match=f"solved, got none of {len(updates)}"):
+        run_points(world, [updates[0], *sparse], result.config)
 
 
 @pytest.mark.parametrize(

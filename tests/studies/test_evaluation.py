@@ -19,7 +19,7 @@ from loam_gtsam.studies.evaluation import (
     pose_differences,
     relative_error,
 )
-from loam_gtsam.types import InputError, Trajectory
+from loam_gtsam.types import FrameStatus, InputError, Trajectory
 
 LATERAL = np.array([0.0, 1.0, 1.0])
 
@@ -316,6 +316,16 @@ def test_a_covariance_that_is_not_positive_definite_does_not_improve_the_nees():
     assert np.isfinite(good.mean)
     assert bad.mean == np.inf
     assert len(updates) - 1 in bad.beyond
+
+
+def test_what_is_lost_before_the_first_fix_of_a_localisation_has_no_error():
+    world = SimulatedWorld("room", frames=6, columns=180, sensor="vlp16")
+    updates = run(world, QUICK).updates
+    nowhere = {"status": FrameStatus.LOST, "map_T_lidar": gtsam.Pose3()}
+    lost = [replace(update, **nowhere) for update in updates[:2]]
+    found = nees([*lost, *updates[2:]], world.truth)
+    assert found.mean == nees(updates[2:], world.truth).mean
+    assert found.frames.tolist() == [3, 4, 5]
 
 
 def test_poses_that_are_no_numbers_have_no_error():

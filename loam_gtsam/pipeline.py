@@ -363,7 +363,7 @@ Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
 def effective_config(config: Config, dataset: Dataset) -> Config:
     """The configuration with what the data set's layout says about the sensor and its IMU.
 
-    A field the user changed from its default wins. InputError if ``dataset`` is none.
+    A field that differs from its default wins. InputError if ``dataset`` is none.
     """
     check_dataset(dataset)
     return with_implied(config, dataset.sensor)

@@ -604,7 +604,7 @@ def test_sweep_is_the_old_name_of_study_and_says_so_and_no_help_is_cut_off(monke
 
 
 def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones() -> None:
-    spec = "sim:street_loop?frames=45&columns=900"
+    spec = "sim:street_loop?frames=45&columns=450"
     longer = "--set", "imu.coupling=off", "--set", "sensor.range_offset=-0.03"
     done = loam("run", spec, "--output", "out", "--no-plot", *longer)
     assert "the ranges look" in done.output

@@ -17,7 +17,7 @@ from loam_gtsam.registration.odometry import Guess
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
 
-FRAMES = 11
+FRAMES = 9
 CLOSE = ("loops.enabled=true", "pose_graph.keyframe_distance=0.2", "loops.min_way=1.0")
 
 

@@ -31,9 +31,9 @@ from loam_gtsam.types import MapUpdate
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """A Dask cluster of a worker process with one thread."""
+    """A Dask cluster of two worker processes with one thread each."""
     distributed = pytest.importorskip("distributed")
-    settings = {"n_workers": 1, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
+    settings = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
     quiet = {"dashboard_address": None, "silence_logs": logging.ERROR}
     with distributed.LocalCluster(**settings, **quiet) as cluster:
         yield cluster
@@ -72,7 +72,7 @@ def test_the_death_of_a_worker_in_the_middle_changes_no_number(tmp_path):
     here = list(trial_runner.run_trials(trials, never))
     flag = tmp_path / "died"
     work = partial(dies, trials[1].id, str(flag))
-    with trial_runner.local_workers(1) as workers:
+    with trial_runner.local_workers(2) as workers:
         rows = list(trial_runner.run_trials(trials, never, workers, work))
     assert flag.exists()
     assert in_order(trials, rows) == repeatable(here)

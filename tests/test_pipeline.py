@@ -41,7 +41,7 @@ from loam_gtsam.types import (
 
 @pytest.mark.parametrize(
     ("scene", "frames", "limit"),
-    [("room", 20, 0.01), ("street_loop", 28, 0.02), ("corridor", 40, 0.03), ("trees", 24, 0.05)],
+    [("room", 12, 0.01), ("street_loop", 20, 0.02), ("corridor", 24, 0.03), ("trees", 16, 0.05)],
 )
 def test_scene_is_mapped_to_centimetres(scene, frames, limit):
     world = SimulatedWorld(scene, frames=frames, columns=600)
@@ -61,7 +61,7 @@ def test_denser_sensors(sensor):
 
 
 def test_scan_to_scan_guess_maps_as_well():
-    world = SimulatedWorld("street_loop", frames=30, columns=450)
+    world = SimulatedWorld("street_loop", frames=22, columns=450)
     config = Config().changed("odometry.method=scan_to_scan")
     result = run(world, config)
     assert absolute_error(result.trajectory, world.truth).rmse < 0.03
@@ -130,7 +130,7 @@ def test_a_run_whose_fixes_cannot_be_tied_is_kept(monkeypatch):
 
 
 def test_same_input_same_bits_at_any_speed():
-    world = SimulatedWorld("street_loop", frames=9, columns=300)
+    world = SimulatedWorld("street_loop", frames=6, columns=300)
     whole = run(world)
     pipeline = Pipeline(whole.config, imu=imu_buffer(world, whole.config))
     single = [pipeline.process(scan) for scan in world]
@@ -241,22 +241,22 @@ BROKEN = {
 
 @pytest.fixture(scope="module")
 def driving():
-    """A world, and six sweeps of it taken at speed."""
-    world = SimulatedWorld("street_loop", frames=26, columns=450)
-    return world, [world[i] for i in range(20, 26)]
+    """A world, a pipeline that has mapped most of it, and the next six sweeps, at speed."""
+    world = SimulatedWorld("street_loop", frames=18, columns=450)
+    sweeps = list(world)
+    return world, run(ListDataset(sweeps[:12]), QUICK).pipeline, sweeps[12:]
 
 
 @pytest.mark.parametrize("says", BROKEN)
 def test_a_bad_sweep_has_a_status_and_the_run_goes_on(driving, says):
-    world, scans = driving[0], [*driving[1]]
-    scans[3] = BROKEN[says](scans[3])
-    result = run(ListDataset(scans))
+    world, pipeline, sweeps = driving[0], deepcopy(driving[1]), [*driving[2]]
+    sweeps[3] = BROKEN[says](sweeps[3])
+    result = pipeline.result([pipeline.process(sweep) for sweep in sweeps])
     bad = result.updates[3]
     assert says in bad.message
     assert bad.status == ("bad_stamp" if "later" in says else "unusable_scan")
     assert np.isnan(bad.covariance).all()
-    truth = world.truth.map_T_lidar[20:26]
-    truth = np.linalg.inv(truth[0]) @ truth
+    truth = world.truth.map_T_lidar[12:]
     for i in (2, 4, 5):
         assert result.updates[i].status.solved
         error = np.linalg.norm(result.updates[i].map_T_lidar.translation() - truth[i][:3, 3])
@@ -340,7 +340,7 @@ def up_error(result, world):
 
 def test_an_imu_levels_the_map_deskews_and_holds_the_tilt(shaken, sweeps):
     """Measured: ATE 7 mm; 12 without."""
-    result = run(data_of(shaken, sweeps))
+    result = run(data_of(shaken, sweeps), QUICK)
     assert result.imu.sweep_motions == {"gyro": 32}
     assert result.imu.tilt_priors == {"none": 1, "equivalent": 31}
     assert result.imu.level.source == "still"
@@ -349,7 +349,7 @@ def test_an_imu_levels_the_map_deskews_and_holds_the_tilt(shaken, sweeps):
     assert result.imu.problems == ()
     np.testing.assert_allclose(result.imu.gyro_bias, (0.002, -0.001, 0.0015), atol=0.002)
     assert up_error(result, shaken) < 0.5
-    without = run(data_of(shaken, sweeps), with_imu(coupling="off"))
+    without = run(data_of(shaken, sweeps), with_imu(QUICK, coupling="off"))
     assert without.imu is None
     assert {(u.sweep_motion, u.tilt_prior) for u in without.updates} == {
         ("constant_velocity", "none")
@@ -369,7 +369,7 @@ def test_every_mode_acts_and_says_so(shaken, sweeps, six, prior):
 def test_a_levelled_map_and_one_of_the_first_pose_see_the_same_path(shaken, sweeps):
     """A platform that stands tilted by 22 degrees: the maps differ by that, the motion does not."""
     tilt = gtsam.Rot3.RzRyRx(0.3, -0.25, 0.0)
-    data = ArrayDataset(sweeps[:25], imu=tilted(shaken.imu, tilt))
+    data = ArrayDataset(sweeps[:20], imu=tilted(shaken.imu, tilt))
     levelled, first = (run(data, with_imu(QUICK, level=on)) for on in (True, False))
     a, b = (result.trajectory.map_T_lidar for result in (levelled, first))
     assert np.array_equal(b[0], np.eye(4))
@@ -382,7 +382,7 @@ def test_a_levelled_map_and_one_of_the_first_pose_see_the_same_path(shaken, swee
     # Up was found in the other map, too.
     np.testing.assert_allclose(first.imu.level.map_up, a[0, 2, :3], atol=1e-9)
     for result in (levelled, first):
-        assert result.imu.tilt_priors["equivalent"] == 24
+        assert result.imu.tilt_priors["equivalent"] == 19
 
 
 def test_an_imu_that_starts_late_is_used_from_then_on(shaken, sweeps):
@@ -423,7 +423,7 @@ def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(shaken, 
 
 @pytest.mark.parametrize("angles", [(180.0, 0.0, 0.0), (0.0, 0.0, 90.0)])
 def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(shaken, sweeps, angles):
-    sweeps = sweeps[:28]
+    sweeps = sweeps[:24]
     data = data_of(shaken, sweeps)
     config = effective_config(with_imu(lidar_R_imu_deg=angles), data)
     pipeline = Pipeline(config, imu=imu_buffer(data, config))
@@ -485,7 +485,7 @@ def test_a_solver_that_was_made_brings_its_settings(sweeps, name):
 
 @pytest.fixture(scope="module")
 def room():
-    world = SimulatedWorld("room", frames=10, columns=450)
+    world = SimulatedWorld("room", frames=9, columns=300)
     return world, list(world)
 
 
@@ -603,9 +603,8 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
         run(data_of(shaken, sweeps[:1]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_foliage_does_not_hold_the_pose(seed):
-    world = SimulatedWorld("trees", frames=35, columns=600, seed=seed)
+def test_foliage_does_not_hold_the_pose():
+    world = SimulatedWorld("trees", frames=35, columns=600, seed=2)
     # Without poles: the trunks alone would do.
     config = Config().changed({"features.post_depth": 0.0, "imu.coupling": "off"})
     positions = run(world, config).trajectory.positions

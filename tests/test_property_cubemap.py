@@ -127,13 +127,13 @@ WEIGHTS = np.array([25, 15, 15, 25, 8, 2, 10])
 @pytest.mark.parametrize(
     ("insertion", "megabytes", "steps"),
     [
-        ("settled", 100.0, 4500),
-        ("centroid", 100.0, 4500),
+        ("settled", 100.0, 2000),
+        ("centroid", 100.0, 2000),
         ("settled", 2e-3, 500),
         ("centroid", 0.0, 500),
     ],
 )
-def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
+def test_five_thousand_random_operations_in_all_are_those_of_a_dictionary(
     insertion: str, megabytes: float, steps: int, tmp_path: Path
 ) -> None:
     config = SMALL.changed(

@@ -27,7 +27,7 @@ def test_the_rings_of_one_sweep_on_open_ground_are_enough_with_a_wide_search(wid
 
 
 def test_a_way_between_poles_on_rough_ground_holds():
-    world = SimulatedWorld("sparse_terrain", frames=40, columns=900)
+    world = SimulatedWorld("sparse_terrain", frames=28, columns=900)
     result = run(world, alone())
     error = absolute_error(result.trajectory, world.truth)
     assert error.rmse < 0.03

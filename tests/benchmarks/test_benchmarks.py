@@ -234,7 +234,7 @@ def test_every_fault_of_the_soak_is_injected_and_counted(
     tmp_path: Path, here: pytest.MonkeyPatch
 ) -> None:
     here.setattr(soak, "QUICK", 160)
-    here.setitem(soak.SCENES, "street_loop", 300)
+    here.setitem(soak.SCENES, "street_loop", 200)
     kept: list[soak.SoakResult] = []
     run = soak.soak
     here.setattr(soak, "soak", lambda *a: kept.append(run(*a)) or kept[-1])
@@ -318,10 +318,15 @@ def random_walk(rng: np.random.Generator, frames: int) -> tuple[list[MapUpdate],
     return updates, true
 
 
-@pytest.mark.parametrize("window", [1, 10, 50])
-def test_right_covariances_have_a_nees_of_one(window: int) -> None:
+@pytest.fixture(scope="module")
+def walks() -> list[Any]:
     rng = np.random.default_rng(2)
-    runs = [worlds.squared_errors(*random_walk(rng, 400), window) for _ in range(10)]
+    return [random_walk(rng, 400) for _ in range(10)]
+
+
+@pytest.mark.parametrize("window", [1, 10, 50])
+def test_right_covariances_have_a_nees_of_one(window: int, walks: list[Any]) -> None:
+    runs = [worlds.squared_errors(*walk, window) for walk in walks]
     values = np.array([value for run in runs for value in run.values()])
     assert len(values) == 10 * (400 - window)
     assert 0.85 < values.mean() / worlds.FREEDOM < 1.15

@@ -354,12 +354,12 @@ def test_forgotten_samples_are_left_out_and_taken_again_after_the_clock_was_set_
     assert live.orientation(last).equals(expected, 0.0)
 
 
-def test_a_day_of_samples_takes_no_more_memory_than_an_hour():
+def test_hours_of_samples_take_no_more_memory_than_one():
     """At 10 Hz, a minute at a time, with a gap, repeats and late ones; through the filter."""
     config = ImuConfig()
     buffer, rng, sizes = ImuBuffer(config), np.random.default_rng(0), []
     count, minute = 600, 60 * 10**9
-    for number in range(24 * 60):
+    for number in range(4 * 60):
         stamps = number * minute + np.arange(count, dtype=np.int64) * 100_000_000
         stamps = np.concatenate([stamps[:300], stamps[310:], stamps[5:9], stamps[:3] - 2 * minute])
         gyro, noise = rng.normal(0.0, 0.1, (2, len(stamps), 3))
@@ -371,4 +371,4 @@ def test_a_day_of_samples_takes_no_more_memory_than_an_hour():
             frozen = freeze({"buffer": buffer}, {"config": config})
             sizes.append(sum(part.nbytes for part in frozen.values()))
     assert max(sizes[1:]) < 1.2 * sizes[0]
-    assert buffer.report.samples > 24 * 60 * 500
+    assert buffer.report.samples > 4 * 60 * 500

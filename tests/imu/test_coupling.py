@@ -135,11 +135,11 @@ def resting(acceleration=(0.0, 0.0, 9.81), rng=None, seconds=12.0):
 
 
 def test_errors_of_poses_of_velocities_and_between_frames_are_as_told():
-    """NEES of 40 runs of 25 frames: of the last state, and of the motion between two frames."""
+    """NEES of 20 runs of 25 frames: of the last state, and of the motion between two frames."""
     rng = np.random.default_rng(0)
     sigmas = np.repeat([1e-3, 5e-3], 3)
     state, motion = [], []
-    for _ in range(40):
+    for _ in range(20):
         data, errors = resting(rng=rng, seconds=4.0), sigmas * rng.standard_normal((30, 6))
         errors[0] = 0.0
         found = [fused for _, fused in drive(TightCoupling(ImuConfig()), data, range(1, 26), errors,

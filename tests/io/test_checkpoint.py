@@ -77,20 +77,20 @@ def held_near_the_start(context):
 
 
 LOOPS = QUICK.changed("loops.enabled=true", "loops.min_way=3", "pose_graph.keyframe_distance=0.7")
-IMU = Config().changed("imu.lag=5")
+IMU = QUICK.changed("imu.lag=5")
 DENSE = QUICK.changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
     "plain": ("street_loop?frames=8&columns=300", Config(), [1, 2, 5]),
     "imu in the graph": ("corridor?frames=12&columns=300", IMU, [3, 10]),
     "scan to scan": (
-        "trees?frames=6&columns=450",
+        "trees?frames=6&columns=300",
         QUICK.changed("odometry.method=scan_to_scan"),
         [4],
     ),
     "classical": ("room?frames=8&columns=400", preset("aloam"), [4]),
     "loops": ("room?frames=30&columns=240&speed=4&start=moving", LOOPS, [12, 24]),
     "own closer": ("room?frames=28&columns=240&speed=4&start=moving", DENSE, [9, 25]),
-    "own factors": ("room?frames=9&columns=400", Config(), [2, 6]),
+    "own factors": ("room?frames=6&columns=300", Config(), [2, 4]),
     "workers": ("room?frames=6&columns=300", QUICK, [4]),
 }
 OPTIONS = {
@@ -308,7 +308,7 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
 
 # -- from the command line ----------------------------------------------------------------------
 
-RUN = ("run", "sim:room?frames=24&columns=240", "--no-plot", *QUICK_START, "--output")
+RUN = ("run", "sim:room?frames=16&columns=240", "--no-plot", *QUICK_START, "--output")
 
 
 def arrays(folder):
@@ -320,7 +320,7 @@ def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert loam(*RUN, whole).exit_code == 0
     again = [*RUN, killed, "--resume", "--checkpoint", "0.05"]
-    for wanted in (6, 14):
+    for wanted in (4, 9):
         command = [sys.executable, "-m", "loam_gtsam.cli", *again]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while process.poll() is None and not reached(killed, wanted):

@@ -99,10 +99,9 @@ def test_the_loop_that_contradicts_most_is_switched_first(active, distances, exp
     assert loop_to_switch(np.array(active, bool), np.array(distances), 40.0) == expected
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_fifty_wrong_loops_do_not_bend_ten_right_ones(seed):
+def test_fifty_wrong_loops_do_not_bend_ten_right_ones():
     truth = square(25, 2)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     odometry = drifted(truth, rng)
     right = right_loops(truth, rng, 10)
     clean = filled(odometry)

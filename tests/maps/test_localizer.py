@@ -97,7 +97,7 @@ def test_a_lidar_without_rings_is_found_in_the_map_of_one_with_rings(mapped, sav
 @pytest.mark.parametrize(("first", "is_found"), [(6, False), (18, True)])
 def test_a_narrow_view_is_not_found_in_a_room_that_looks_the_same(mapped, saved, first, is_found):
     """Rooms repeat, and the right pose need not be one of the three likeliest of a place."""
-    drive = SimulatedWorld("rooms", seed=1, frames=first + 6, sensor="avia")
+    drive = SimulatedWorld("rooms", seed=1, frames=first + SWEEPS + 1, sensor="avia")
     drive._seed = 2
     found = localise(PartOf(drive, first, 1), saved)
     assert found.fixes == is_found
@@ -363,20 +363,21 @@ def test_places_are_looked_at_once_and_a_pose_beyond_the_map_harms_no_search(
 
 
 def test_where_bays_repeat_a_lidar_is_found_if_it_is_surely_in_the_map_or_its_place_is_said(
-    tmp_path,
+    tmp_path, monkeypatch
 ):
     """Another storey would look the same but for what is parked there."""
+    begin_quickly(monkeypatch)
     monday = SimulatedWorld("garage", seed=1, frames=50, columns=600)
     mapped = run(monday)
     save_map(tmp_path / "garage.lgmap", mapped.pipeline)
     tuesday = SimulatedWorld("garage", seed=1, frames=50, columns=600, range_noise=0.03)
     drive = PartOf(tuesday, 30, 1, None, None)
     with SavedMap(tmp_path / "garage.lgmap") as saved:
-        assert not localise(drive, saved, max_frames=8).fixes
+        assert not localise(drive, saved, max_frames=6).fixes
         x, y, z = mapped.updates[30].map_T_lidar.translation()
         found = [
-            localise(drive, saved, max_frames=8, inside=True),
-            localise(drive, saved, max_frames=8, near=(x - 3.0, y + 3.0)),
+            localise(drive, saved, max_frames=6, inside=True),
+            localise(drive, saved, max_frames=6, near=(x - 3.0, y + 3.0)),
         ]
         assert not localise(drive, saved, max_frames=6, near=(x - 12.0, y, z)).fixes
     true = dict(zip(monday.truth.stamps.tolist(), monday.truth.map_T_lidar, strict=True))

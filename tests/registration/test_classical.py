@@ -442,7 +442,7 @@ def test_a_preset_names_its_solver(name, kind):
 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_a_preset_maps_raw_sweeps(name):
-    world = SimulatedWorld("street_loop", frames=10)
+    world = SimulatedWorld("street_loop", frames=10, columns=900)
     result = run(world, preset(name))
     assert all(u.status.solved for u in result.updates[1:])
     there = world.truth.map_T_lidar[:10]

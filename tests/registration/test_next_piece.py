@@ -28,9 +28,13 @@ from loam_gtsam.types import FrameStatus, Trajectory
 AT, AGAIN, LOST = 8, 20, 8
 """The first missing sweep, the first one after the gap, and how many are lost then."""
 CONFIG = Config().changed(
-    f"relocalization.new_piece={LOST}", "relocalization.radius=0", "relocalization.max_radius=0"
-)
+    f"relocalization.new_piece={LOST}", "relocalization.radius=0", "relocalization.max_radius=0",
+    "solver.iterations=5",
+)  # fmt: skip
 """With a quick search."""
+SOON = 5
+QUICK = CONFIG.changed(f"relocalization.new_piece={SOON}")
+"""With :func:`support.quick.begin_quickly` a piece is there after as many sweeps."""
 FORWARD = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
 USUAL = np.repeat([0.5, 2.0], 3) ** 2
 
@@ -139,15 +143,11 @@ def carried():
     return ArrayDataset([*world, *later], sensor=world.sensor, imu=world.imu)
 
 
-QUICK = CONFIG.changed("relocalization.new_piece=5")
-"""With :func:`support.quick.begin_quickly` a piece is there after as many sweeps."""
-
-
 def test_loops_tie_the_pieces(carried, monkeypatch):
     begin_quickly(monkeypatch)
     config = QUICK.changed("loops.enabled=true", "pose_graph.keyframe_distance=1.3")
     result = run(carried, config.changed("imu.coupling=off"))
-    assert CONTINUED in result.updates[24 + 4].message
+    assert CONTINUED in result.updates[24 + SOON - 1].message
     before, end = result.updates[24 - 1], result.updates[-1]
     assert end.map_T_lidar.range(before.map_T_lidar) > 20.0
     closed = [gtsam.Pose3(pose) for pose in result.trajectory.map_T_lidar]
@@ -155,7 +155,7 @@ def test_loops_tie_the_pieces(carried, monkeypatch):
     # What is corrected is the gap, and neither the frames before it nor those after.
     for pose, update in zip(closed[:24], result.updates[:24], strict=True):
         assert pose.range(update.map_T_lidar) < 0.02
-    for pose, update in zip(closed[24 + 4 :], result.updates[4:24], strict=True):
+    for pose, update in zip(closed[24 + SOON - 1 :], result.updates[SOON - 1 : 24], strict=True):
         assert pose.range(update.map_T_lidar) < 0.05
 
 
@@ -163,10 +163,10 @@ def test_a_checkpoint_holds_the_piece_that_is_not_used_yet(carried, monkeypatch)
     begin_quickly(monkeypatch)
     config, sweeps = effective_config(QUICK, carried), list(carried)
     one, two = (Pipeline(config, imu=imu_buffer(carried, config)) for _ in range(2))
-    for sweep in sweeps[12 : 24 + 4]:
+    for sweep in sweeps[12 : 24 + SOON - 1]:
         one.process(sweep)
     thaw(freeze(*one.state()), *two.state())
-    for sweep in sweeps[24 + 4 : 24 + 6]:
+    for sweep in sweeps[24 + SOON - 1 : 24 + SOON + 1]:
         updates = [pipeline.process(sweep) for pipeline in (one, two)]
         np.testing.assert_array_equal(*(update.map_T_lidar.matrix() for update in updates))
         np.testing.assert_array_equal(*(update.covariance for update in updates))

@@ -337,7 +337,7 @@ def test_a_motion_that_explains_the_sweeps_nearly_as_well_is_told():
 
 def test_where_nothing_passes_the_eighth_sweep_leaves_no_doubt():
     for scene in ("street_loop", "room"):
-        _, features = features_of(scene, 9)
+        _, features = features_of(scene, 9, columns=300)
         mapper = Mapper(CONFIG)
         updates = [mapper.register(one) for one in features]
         assert not any(update.uncertainty.in_doubt for update in updates[1:])
@@ -646,7 +646,7 @@ def test_of_the_first_four_sweeps_of_a_refined_start_only_the_second_is_searched
 
 
 def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
-    _, features = features_of("corridor", 2, start="moving")
+    _, features = features_of("corridor", 2, start="moving", columns=300)
     found, closer = [], []
     for share in (0.0, first_sweeps._HOPEFUL, 1.0):
         monkeypatch.setattr(first_sweeps, "_HOPEFUL", share)
@@ -727,7 +727,7 @@ def test_a_good_guess_of_a_user_stays_and_a_bad_one_does_not():
 
 
 def test_the_map_is_made_anew_of_the_first_sweeps_and_then_left_alone():
-    _, features = features_of("room", 11)
+    _, features = features_of("room", 11, columns=300)
     mapper = Mapper(CONFIG.changed("map.small_below=0"))  # one pair of maps
     changed = []
     for one in features:

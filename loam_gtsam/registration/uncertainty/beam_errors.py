@@ -19,7 +19,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import BoolArray, FloatArray
 
 _KINDS = "ranges", "elevations", "azimuths"
 _EXPECTED = np.array([0.02, np.radians(0.05), np.radians(0.05)])
@@ -35,6 +35,9 @@ _FREEDOMS = 6.0
 its pose explain. What explains less moves a pose by less than its own standard deviation."""
 _ODD = 5.0
 """Standard deviations of the mean of what they explain, beyond which it is no chance."""
+_ALIKE = 2.33
+"""Standard deviations by which errors of neighbouring beams may be alike: 1 % of independent ones
+are more so. What changes evenly with the elevation, surfaces may make as well."""
 _MORE = 1.5
 """Times the rings of a sweep: if more elevations were met, these are not those of beams."""
 _TOGETHER = 1e3
@@ -182,7 +185,20 @@ class BeamErrors:
             return False, False, False
         mean = self._sums / self._count
         variance = np.maximum(self._squares / self._count - mean**2, 1e-300) / self._count
-        return tuple(((mean > _FREEDOMS) & (mean > _ODD * np.sqrt(variance))).tolist())
+        real = (mean > _FREEDOMS) & (mean > _ODD * np.sqrt(variance))
+        return tuple((real & self._independent()).tolist())
+
+    def _independent(self) -> BoolArray:
+        """(3,) whether the errors of neighbouring beams differ as those of any two do.
+
+        The mean squared difference over the variance is 2 then, with a standard deviation of 2 over
+        the root of their number (von Neumann, Annals of Mathematical Statistics 12, 1941).
+        """
+        errors = self._errors.reshape(-1, 3)
+        differences = np.sum(np.diff(errors, axis=0) ** 2, axis=0)
+        least = 2.0 - 2.0 * _ALIKE / np.sqrt(len(errors))
+        apart: BoolArray = differences > least * np.sum((errors - errors.mean(axis=0)) ** 2, axis=0)
+        return apart
 
     @property
     def advised(self) -> tuple[BeamRow, ...]:

@@ -30,7 +30,11 @@ _ADVICE = {
     FrameStatus.BAD_STAMP: "the stamps of the sweeps, or the times of their points, are wrong: "
     "see loam-gtsam inspect",
 }
-_ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
+_ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
+_ADVICE[FrameStatus.FEW_MATCHES] = (
+    f"{_ADVICE[FrameStatus.LOST]}; if sweeps are parts of a turn, each of which sees another side, "
+    "join them"
+)
 _PIECE = " in another piece of map"  # in the message of the first frame there
 _MOVED = "moved by "  # in the message of a frame that was searched for
 _CONTRARY = "as if no IMU had been there"  # in that of a frame that fits better so

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from loam_gtsam import Config, RunResult, SimulatedWorld, run
 from loam_gtsam.datasets.sim.disturbances import Disturbance, Disturbed
 from loam_gtsam.frontend.beams import moved
-from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
+from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors, independent
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, Scan
 
@@ -89,6 +89,15 @@ def test_a_map_without_errors_of_beams_is_right() -> None:
     left = errors_of(right).explained[0]
     assert left < 0.4 * found.explained[0]  # the map has had a part of them
     assert ate(right) < ate(wrong)
+
+
+@pytest.mark.parametrize("beams", [16, 64, 128])
+def test_errors_that_change_evenly_with_the_elevation_are_not_those_of_beams(beams: int) -> None:
+    rng = np.random.default_rng(beams)
+    alone = [independent(rng.normal(size=(beams, 3))) for _ in range(200)]
+    assert 0.96 < np.mean(alone) < 1.0
+    even = np.cos(np.linspace(0.0, 6.0, beams)[:, None] + [0.0, 1.0, 2.0])
+    assert not independent(even + 0.1 * rng.normal(size=(beams, 3))).any()
 
 
 class Askew(Disturbance):

@@ -186,19 +186,7 @@ class BeamErrors:
         mean = self._sums / self._count
         variance = np.maximum(self._squares / self._count - mean**2, 1e-300) / self._count
         real = (mean > _FREEDOMS) & (mean > _ODD * np.sqrt(variance))
-        return tuple((real & self._independent()).tolist())
-
-    def _independent(self) -> BoolArray:
-        """(3,) whether the errors of neighbouring beams differ as those of any two do.
-
-        The mean squared difference over the variance is 2 then, with a standard deviation of 2 over
-        the root of their number (von Neumann, Annals of Mathematical Statistics 12, 1941).
-        """
-        errors = self._errors.reshape(-1, 3)
-        differences = np.sum(np.diff(errors, axis=0) ** 2, axis=0)
-        least = 2.0 - 2.0 * _ALIKE / np.sqrt(len(errors))
-        apart: BoolArray = differences > least * np.sum((errors - errors.mean(axis=0)) ** 2, axis=0)
-        return apart
+        return tuple((real & independent(self._errors.reshape(-1, 3))).tolist())
 
     @property
     def advised(self) -> tuple[BeamRow, ...]:
@@ -235,3 +223,15 @@ class BeamErrors:
             f"{100.0 * share:.0f} % of what the matches leave; poses are worse than told: map with "
             "sensor.beams, which a run writes to beams.yaml (--config)"
         )
+
+
+def independent(errors: FloatArray) -> BoolArray:
+    """(3,) whether errors (B, 3) of neighbouring beams differ as those of any two do.
+
+    Their mean squared difference over the variance is 2 then, with a standard deviation of 2 over
+    the root of B (von Neumann, Annals of Mathematical Statistics 12, 1941).
+    """
+    differences = np.sum(np.diff(errors, axis=0) ** 2, axis=0)
+    least = 2.0 - 2.0 * _ALIKE / np.sqrt(len(errors))
+    apart: BoolArray = differences > least * np.sum((errors - errors.mean(axis=0)) ** 2, axis=0)
+    return apart

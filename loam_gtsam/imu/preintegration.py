@@ -66,13 +66,14 @@ class Prediction:
     """Pose of the next frame by the IMU, and (3,) m/s of the lidar, map frame.
 
     The (6, 6) covariance of the pose, ``[rotation, translation]``, right perturbation, is regular;
-    ``across`` (3, 6) is that of the velocity with the pose.
+    ``across`` (3, 6) is that of the velocity with the pose, ``spread`` (3, 3) that of the velocity.
     """
 
     map_T_lidar: gtsam.Pose3
     velocity: FloatArray
     covariance: FloatArray
     across: FloatArray
+    spread: FloatArray
 
     @property
     def covariance_in_map(self) -> FloatArray:
@@ -80,10 +81,17 @@ class Prediction:
         to_map = self.map_T_lidar.AdjointMap()
         return symmetric(to_map @ self.covariance @ to_map.T)
 
-    def velocity_at(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
-        """(3,) m/s of the lidar, map frame: what is expected if this is the pose."""
+    def velocity_at(self, map_T_lidar: gtsam.Pose3, known: float) -> FloatArray:
+        """(3,) m/s of the lidar, map frame: what is expected if this is the pose.
+
+        What is ``known`` to within so many m/s stays as it is predicted: a scan that is de-skewed
+        for the velocity of whatever pose it is tried at may be bent until it fits there.
+        """
         away = self.map_T_lidar.localCoordinates(map_T_lidar)
-        expected: FloatArray = self.velocity + self.across @ np.linalg.solve(self.covariance, away)
+        variances, axes = np.linalg.eigh(self.spread)
+        vague = axes[:, variances > known**2]
+        told = vague.T @ self.across @ np.linalg.solve(self.covariance, away)
+        expected: FloatArray = self.velocity + vague @ told
         return expected
 
 
@@ -183,6 +191,7 @@ class InertialOdometry:
             *self._of_lidar(frame.predicted, frame.rate),
             self._to_lidar @ covariance[POSE, POSE] @ self._to_lidar.T,
             covariance[VELOCITY, POSE] @ self._to_lidar.T,
+            covariance[VELOCITY, VELOCITY],
         )
         if not _has_inverse(prediction.covariance):
             raise SweepError("IMU samples: the covariance of the motion they make has no inverse")

@@ -356,7 +356,8 @@ class FrameMatcher(Matcher):
     def twist_to(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6,) mean body velocity that leads to a pose."""
         posed = self.posed
-        return twist_to(posed.sweep, self.last, self.inertial, map_T_lidar, posed.twist)
+        known = self.last, self.inertial, map_T_lidar, posed.twist
+        return twist_to(posed.sweep, *known, self.config.features.range_noise)
 
     def _tells(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> bool:
         """Whether the matches tell the motion within the sweep."""

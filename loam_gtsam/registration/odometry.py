@@ -254,19 +254,22 @@ def twist_to(
     inertial: InertialPrediction | None,
     map_T_middle: gtsam.Pose3,
     otherwise: FloatArray,
+    range_noise: float,
 ) -> FloatArray:
     """(6,) body velocity that belongs to a pose at the middle of a sweep.
 
     It is that between the middles of the last sweep and of this sweep; ``otherwise`` without a last
     sweep, or if its middle is not earlier (sweeps of unlike length). With the IMU's prediction the
-    velocity is that which is expected if this is the pose.
+    velocity is that which is expected if this is the pose, or predicted where its error moves no
+    point by more than ``range_noise``, metres.
     """
     twist = otherwise
     if last is not None and sweep.stamp > last.stamp:
         twist = sweep.twist_since(last[:2], map_T_middle)
     if inertial is None:
         return twist
-    velocity = map_T_middle.rotation().matrix().T @ inertial.velocity_at(map_T_middle)
+    known = 2.0 * range_noise / max(sweep.duration, _SHORTEST)
+    velocity = map_T_middle.rotation().matrix().T @ inertial.velocity_at(map_T_middle, known)
     return sweep.twist_at_reference(twist[:3], velocity)
 
 

@@ -114,7 +114,8 @@ class Checkpoint:
             If the state cannot be kept, the checkpoint is of another run or version or cannot be
             read, or other files in the folder have the names of its files.
         """
-        self._about = {"loam_gtsam": installed_version(), **about}
+        parts = json.dumps({name: "given" for name in {**roots, **shared} if "." not in name})
+        self._about = {"loam_gtsam": installed_version(), **about, "list of parts": parts}
         self._parts = []
         try:
             freeze(roots, shared)

@@ -357,6 +357,10 @@ class Localisation:
     localizer: Localizer
     error: Exception | None = None
 
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{n} {status}" for status, n in self.status_counts.items())
+        return f"Localisation({len(self.updates)} updates: {counts}; {self.fixes} fixes)"
+
     @property
     def status_counts(self) -> dict[str, int]:
         """How many sweeps ended in which status."""

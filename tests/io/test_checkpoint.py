@@ -207,6 +207,16 @@ def test_what_cannot_be_kept_later_costs_checkpoints_but_no_results(end, tmp_pat
     assert "Foreign cannot be in a checkpoint" in caplog.text
 
 
+def test_other_parts_are_told(tmp_path):
+    dataset = open_dataset("sim:room?frames=3&columns=300")
+    stopped(dataset, QUICK, tmp_path, 2)
+    resumed = Checkpoint(tmp_path, resume=True)
+    with pytest.raises(
+        OutputError, match="list of parts was extra_factors None, now it is extra_factors given"
+    ):
+        run(dataset, QUICK, checkpoint=resumed, extra_factors=lambda context: [])
+
+
 def test_another_configuration_is_told(tmp_path):
     dataset, other = (
         open_dataset(f"sim:{world}?frames=3&columns=300") for world in ("room", "trees")

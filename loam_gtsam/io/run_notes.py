@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from loam_gtsam.io.run_files import position_sigmas
-from loam_gtsam.types import FrameStatus, MapUpdate, SweepMotion
+from loam_gtsam.types import FrameStatus, MapUpdate, SweepFault, SweepMotion
 
 if TYPE_CHECKING:
     from loam_gtsam.aiding.imu_summary import ImuSummary
@@ -35,6 +35,7 @@ _ADVICE[FrameStatus.FEW_MATCHES] = (
     f"{_ADVICE[FrameStatus.LOST]}; if sweeps are parts of a turn, each of which sees another side, "
     "join them"
 )
+_PART_FAILED = "a part of your own raised exceptions, which the messages of the frames tell"
 _PIECE = " in another piece of map"  # in the message of the first frame there
 _MOVED = "moved by "  # in the message of a frame that was searched for
 _CONTRARY = "as if no IMU had been there"  # in that of a frame that fits better so
@@ -145,10 +146,12 @@ def _on_statuses(updates: Sequence[MapUpdate], path: float, few: bool) -> list[s
     doubted = [updates[number] for number in odd if _doubtful(updates[number], path)]
     counts = Counter(updates[number].status for number in odd).most_common()
     statuses = ", ".join(f"{count} {status}" for status, count in counts)
+    failed = sum(updates[number].fault is SweepFault.PART_FAILED for number in odd)
+    advice = _ADVICE[counts[0][0]] if 2 * failed <= len(odd) else _PART_FAILED
     return [
         f"{DO_NOT_TRUST if len(doubted) > _TOO_MANY * len(updates) else ''}"
         f"{len(odd)} of {len(updates)} poses ({100.0 * len(odd) / len(updates):.0f} %) are not "
-        f"fixed by their scans ({statuses}), first that of frame {odd[0]}; {_ADVICE[counts[0][0]]}"
+        f"fixed by their scans ({statuses}), first that of frame {odd[0]}; {advice}"
     ]
 
 

@@ -30,6 +30,7 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     OutputError,
+    SweepFault,
     SweepMotion,
     Trajectory,
 )
@@ -287,6 +288,15 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["notes"] == list(doubted.notes)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
+
+
+def test_what_a_part_of_ones_own_failed_in_is_not_put_down_to_the_scans(result):
+    wrong = {"status": FrameStatus.UNUSABLE_SCAN, "fault": SweepFault.EMPTY}
+    of_the_scan = [replace(update, **wrong) for update in result.updates[2:]]
+    of_the_part = [replace(update, fault=SweepFault.PART_FAILED) for update in of_the_scan]
+    for updates, advice in ((of_the_scan, "inspect"), (of_the_part, "a part of your own raised")):
+        (note,) = replace(result, updates=(*result.updates[:2], *updates)).notes
+        assert advice in note.rpartition(";")[2]
 
 
 def test_poses_that_still_move_are_a_note_but_with_a_loam_whose_iterations_are_two(result):

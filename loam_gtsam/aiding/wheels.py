@@ -146,12 +146,17 @@ def wheels_problem(odometry: object) -> str:
 def aided_odometry(
     config: Config, wheels: WheelSamples | None, imu: Turns | None
 ) -> WheelOdometry | None:
-    """The prediction by the wheels, if they are to be used and there are any.
+    """The prediction by the wheels, if they are to be used.
 
-    Raises ConfigError if the accelerometer predicts.
+    Raises ConfigError if there are none, or the accelerometer predicts.
     """
-    if wheels is None or not config.aiding.wheels:
+    if not config.aiding.wheels:
         return None
+    if wheels is None:
+        raise ConfigError(
+            "aiding.wheels: expected the odometry of the wheels, got none; give it to Pipeline as "
+            "wheels=WheelSamples(...), or leave aiding.wheels out"
+        )
     if imu is not None and config.imu.coupling == "tight":
         raise ConfigError(
             "aiding.wheels: with imu.coupling tight the accelerometer predicts, not the wheels; "

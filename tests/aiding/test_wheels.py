@@ -8,7 +8,7 @@ from loam_gtsam.config import AidingConfig, Config
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.decode.aiding import WheelSamples
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.pipeline import run
+from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.studies.comparison import compare_solvers
 from loam_gtsam.studies.contenders import Contender
 from loam_gtsam.studies.evaluation import absolute_error
@@ -80,6 +80,11 @@ def test_twists_are_integrated():
     twists = np.tile([0.0, 0.0, np.pi / 2, 1.0, 0.0, 0.0], (len(stamps), 1))
     end = WheelSamples.of_twists(stamps, twists).start_T_body[-1]
     np.testing.assert_allclose(end[:3, 3], [2 / np.pi, 2 / np.pi, 0.0], atol=1e-9)
+
+
+def test_wheels_that_are_asked_for_must_be_there():
+    with pytest.raises(ConfigError, match=r"aiding\.wheels: expected .* got none"):
+        Pipeline(OFF.changed(aiding=MOUNTED))
 
 
 def test_what_cannot_be_is_refused(tunnel):

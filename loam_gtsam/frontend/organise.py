@@ -18,6 +18,7 @@ from loam_gtsam.frontend.rings import (
     RingAssignment,
     are_rings,
     azimuth_steps,
+    azimuths_about_axis,
     beams_of,
     rings_from_elevation,
     rings_from_file_order,
@@ -341,11 +342,11 @@ def _check_sensor(
 def _times_from_azimuth(
     columns: SweepColumns, rings: RingAssignment, sensor: SensorConfig
 ) -> TimeAssignment:
-    """Times in proportion to the angle turned since the start of the sweep."""
+    """Times in proportion to the angle turned since the start of the sweep, about its axis."""
+    azimuths = azimuths_about_axis(columns.xyz, rings.rings)
     order = slice(None) if rings.ring_major else np.argsort(rings.rings, kind="stable")
-    number = rings.rings[order]
-    same_ring = number[1:] == number[:-1]
-    azimuth = columns.azimuth[order]
+    same_ring = np.diff(rings.rings[order]) == 0
+    azimuth = azimuths[order]
     steps = azimuth_steps(azimuth) * same_ring  # none from one ring to the next
     clockwise, in_order, why = _sense(steps, rings, sensor)
     sign = -1.0 if clockwise else 1.0
@@ -353,7 +354,7 @@ def _times_from_azimuth(
         start = float(np.deg2rad(sensor.start_azimuth_deg))
     else:
         start = _beginning(azimuth, steps, same_ring) if in_order else np.pi
-    turned = columns.azimuth * np.float32(sign / (2.0 * np.pi))
+    turned = azimuths * np.float32(sign / (2.0 * np.pi))
     turned = turned - np.float64(sign * start / (2.0 * np.pi))
     fraction = turned - np.floor(turned)
     if in_order:

@@ -6,13 +6,19 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, DeskewConfig, SensorConfig
 from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
-from loam_gtsam.frontend.rings import ELEVATIONS, are_level, rings_from_file_order
+from loam_gtsam.frontend.rings import (
+    ELEVATIONS,
+    are_level,
+    azimuths_about_axis,
+    rings_from_file_order,
+)
 from loam_gtsam.types import Scan, SweepError, SweepFault
 
 VLP16 = ELEVATIONS["vlp16"]
@@ -476,3 +482,22 @@ def test_ouster_has_128_rings_with_one_point_a_column(shared_data: Path) -> None
     for part in np.split(sweep.times, sweep.ring_starts[1:-1]):
         repeated = np.count_nonzero(np.diff(part) == 0.0)
         assert repeated <= 0.01 * len(part)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0), (30.0, 40.0), (180.0, 0.0)])
+def test_times_from_azimuth_are_about_the_axis_of_the_rings(angles: tuple[float, float]) -> None:
+    """Points may be in the axes of a base on which the lidar is mounted askew."""
+    scan = next(iter(SimulatedWorld("room", frames=1, columns=450)))
+    assert scan.times is not None
+    turn = Rotation.from_euler("yx", angles, degrees=True).as_matrix().T
+    found = organise(Scan(scan.points @ turn, scan.stamp, rings=scan.rings), Config())
+    assert found.timing.method == "azimuth"
+    np.testing.assert_allclose(found.times, scan.times[found.index], atol=2e-5)
+
+
+def test_rings_that_have_no_axis_leave_azimuths_as_they_are() -> None:
+    """As the arcs of a rosette, whose numbers are those of its beams."""
+    rng = np.random.default_rng(2)
+    xyz = rng.normal(size=(3, 600)).astype(np.float32)
+    azimuths = azimuths_about_axis(xyz, np.arange(600) % 6)
+    np.testing.assert_array_equal(azimuths, np.arctan2(xyz[1], xyz[0]))

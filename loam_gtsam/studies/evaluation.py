@@ -276,7 +276,9 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     ----------
     updates : of a run, in order; without corrections of loop closures, which have no covariance
         here
-    reference : interpolated at the stamps of the updates
+    reference : interpolated at the stamps of the updates, which costs centimetres where its poses
+        are a sweep apart and ``deskew.reference`` is ``middle``: give one at these stamps
+        (``SimulatedWorld.truth_at``)
     window : motions over so many frames, with :func:`~loam_gtsam.relative_covariance`; 0 for poses
         since the first frame inside the reference, with ``MapUpdate.covariance``; what is lost
         before the first fix of a localisation is left out

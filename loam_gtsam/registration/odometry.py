@@ -261,14 +261,14 @@ def twist_to(
     It is that between the middles of the last sweep and of this sweep; ``otherwise`` without a last
     sweep, or if its middle is not earlier (sweeps of unlike length). With the IMU's prediction the
     velocity is that which is expected if this is the pose, or predicted where its error moves no
-    point by more than ``range_noise``, metres.
+    point by more than a quarter of ``range_noise``, metres: that of the mean of 16 points.
     """
     twist = otherwise
     if last is not None and sweep.stamp > last.stamp:
         twist = sweep.twist_since(last[:2], map_T_middle)
     if inertial is None:
         return twist
-    known = 2.0 * range_noise / max(sweep.duration, _SHORTEST)
+    known = 0.5 * range_noise / max(sweep.duration, _SHORTEST)
     velocity = map_T_middle.rotation().matrix().T @ inertial.velocity_at(map_T_middle, known)
     return sweep.twist_at_reference(twist[:3], velocity)
 

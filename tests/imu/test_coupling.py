@@ -21,7 +21,7 @@ from loam_gtsam.types import Features, ImuSamples
 
 DOWN = np.array([0.0, 0.0, -9.81])
 FRAME = 100_000_000
-KNOWN = 0.4  # m/s: 2 cm in half a sweep
+KNOWN = 0.1  # m/s: 5 mm in half a sweep
 NOW = START + 500_000_000
 SECONDS = np.linspace(-0.15, 0.06, 41)
 RATE = np.array([0.3, -0.2, 0.9])

@@ -166,7 +166,7 @@ def test_a_motion_is_not_free_that_is_known_or_assumed(parts):
     second, last, maps = parts
     known = {"accelerations": expected(last, 1.0)}
     constant = CONFIG.changed("deskew.model=constant")
-    inertial = Inertial(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)))
+    inertial = Inertial(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)), np.eye(3))
     others = [
         matcher_of(*parts),
         matcher_of(*parts, refine=False, **known),

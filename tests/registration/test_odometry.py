@@ -126,7 +126,7 @@ class Inertial(Gyro):
     """A gyro with an accelerometer that knows one pose."""
 
     known = Predicted(
-        OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)), np.zeros((3, 6))
+        OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)), np.zeros((3, 6)), np.eye(3)
     )
 
     def predict(self, stamp):

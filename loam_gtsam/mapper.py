@@ -33,7 +33,13 @@ from loam_gtsam.registration.relocalization import (
     unplaced,
 )
 from loam_gtsam.registration.report import Clock, checksum, make_update, problem_of, status_of
-from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
+from loam_gtsam.registration.solvers import (
+    POSE_KEY,
+    MotionPrior,
+    ScanSolver,
+    Solution,
+    make_solver,
+)
 from loam_gtsam.registration.solvers.own_factors import (
     ExtraFactors,
     NamedSolver,
@@ -336,8 +342,12 @@ def _beside_own(
     if extra is not None:
         context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, last[:2])
         own = own_factors(extra, context, last.error)
-    if priors or any(own):
-        motion = predicted.motion.of_any_velocity(last.seconds_to(stamp), config)
+    with own_code("extra_factors", extra):
+        others = MotionPrior.of_factors(
+            [*priors, *own.alone, *own.since_last], predicted.map_T_middle
+        )
+    if others is not None:
+        motion = predicted.motion.beside(others, last.seconds_to(stamp), config)
         predicted = replace(predicted, motion=motion)
     return predicted, own
 

@@ -246,7 +246,8 @@ def check_placed(updates: Sequence[MapUpdate]) -> None:
     begins = any(update.status is FrameStatus.FIRST for update in updates)
     if not solved and len(updates) > 1:
         raise InputError(f"updates: expected frames that were solved, got none of {len(updates)}")
-    if solved and not begins and any(not one.status.solved for one in updates[: solved[0]]):
+    lost = any(one.status is FrameStatus.LOST for one in updates[: solved[0] if solved else 0])
+    if lost and not begins:
         raise InputError(
             f"updates: the first {solved[0]} frames were not found in a map (localise), and their "
             f"poses mean nothing; give dataset.part({solved[0]}) and updates[{solved[0]}:]"

@@ -11,13 +11,13 @@ import pytest
 from support.quick import QUICK, begin_quickly
 from support.worlds import seen_from_first
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.registration.solvers import POSE_KEY, MotionPrior
 from loam_gtsam.registration.solvers.own_factors import LAST_KEY, PoseContext, own_factors
 from loam_gtsam.studies.evaluation import absolute_error, nees
 from loam_gtsam.types import Features, FrameStatus, InputError
@@ -172,6 +172,19 @@ def test_where_the_scan_is_blind_own_factors_decide(make, sigma, grows):
     told = [np.sqrt(update.covariance[3, 3]) for update in result.updates]
     expected = sigma * (np.sqrt(len(told)) if grows else 1.0)
     assert 0.7 * expected < told[-1] < 2.0 * expected
+
+
+def test_the_expected_motion_stays_where_own_factors_hardly_tell_it():
+    expected = MotionPrior(LAST, np.diag([1e6] * 3 + [1e4] * 3))
+    sigmas = np.array([1.0, 1e-3, 1.0, 0.2, 50.0, 1.5])
+    beside = expected.beside(MotionPrior(LAST, np.diag(sigmas**-2)), 0.1, SolverConfig())
+    kept = [True, False, True, False, True, True]
+    variances = np.diag(np.linalg.inv(beside.information))
+    possible = np.repeat([0.05, 1.0], 3) ** 2  # rad and m within 0.1 s
+    before = np.repeat([1e-6, 1e-4], 3)
+    np.testing.assert_allclose(variances, np.where(kept, before, before + possible))
+    for same in (replace(expected, measured=True), replace(expected, information=np.zeros((6, 6)))):
+        assert same.beside(MotionPrior(LAST, 1e6 * np.eye(6)), 0.1, SolverConfig()) is same
 
 
 def test_a_height_in_a_corridor_leaves_the_way_along_it_alone(monkeypatch):

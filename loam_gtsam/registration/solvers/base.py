@@ -159,16 +159,19 @@ class MotionPrior:
         step = np.linalg.lstsq(information, pull, rcond=None)[0]
         return cls(near.retract(step), information)
 
-    def of_any_velocity(self, seconds: float, config: SolverConfig) -> MotionPrior:
-        """The expected pose if of the velocity no more is known than at the start of a run.
+    def beside(self, others: MotionPrior, seconds: float, config: SolverConfig) -> MotionPrior:
+        """The expected pose beside what factors of a user's own tell of it.
 
-        Beside factors of a user's own it counts for no more: a velocity that poses before have told
-        outvotes them, and so tells itself in the next frame. What is measured stays as it is.
+        Where these tell more than that no velocity is beyond those of the start of a run, it counts
+        for that only: a velocity that poses before have told outvotes them, and so tells itself in
+        the next frame. What is measured stays as it is.
         """
         if self.measured or not self.information.any():
             return self
-        unknown = seconds * np.repeat([config.start_turn, config.start_speed], 3)
-        variances = np.linalg.inv(self.information) + np.diag(unknown**2)
+        possible = seconds * np.repeat([config.start_turn, config.start_speed], 3)
+        known, axes = np.linalg.eigh(others.information * np.outer(possible, possible))
+        told = possible[:, None] * axes[:, known > 1.0]
+        variances = np.linalg.inv(self.information) + told @ told.T
         return replace(self, information=np.linalg.inv(variances).astype(np.float64))
 
     def along(self, directions: FloatArray) -> MotionPrior:

@@ -33,8 +33,7 @@ class ScanError:
     ----------
     covariance : (6, 6) of the pose if the map were exact
     renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time
-    user : (6, 6) share of the pose that factors beside the scan decide, those since the last pose
-        only where the scan helps
+    user : (6, 6) share of the pose that factors beside the scan decide
     expected : (6, 6) share of the pose that the expected motion decides
     raw : (6, 6) raw covariance of what scan and other factors decide
     information : (6, 6) of the scan alone, for other factors; none along degenerate directions
@@ -143,8 +142,7 @@ def scan_error(
     """
     pose, lines = solution.map_T_lidar, 2 * len(solution.matches.edges)
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
-    weak = np.zeros((6, 6)) if solution.weak is None else solution.weak
-    keep = np.eye(6) - weak
+    keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
     residuals, jacobian = _as_solved(solution, rows, keep)
     points = transform(pose.matrix(), rows.points)
     information: FloatArray = jacobian.T @ jacobian
@@ -154,6 +152,7 @@ def scan_error(
         total = total + expected
     priors = nearest_positive(total - information)
     if expected is None:  # of a solver that does not say: all priors along weak directions
+        weak = np.eye(6) - keep
         expected = weak.T @ priors @ weak
     if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
@@ -184,7 +183,7 @@ def scan_error(
     step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
     parts = meat + priors, renewed, total - expected
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
-    shares, since_last = _shares(bread, priors, expected, weak, between)
+    shares = bread @ keep.T @ priors @ keep, bread @ expected
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
     times = np.zeros(len(residuals)) if seconds is None else seconds
     by_velocity, by_acceleration = (
@@ -198,22 +197,15 @@ def scan_error(
     seen.add(pose.AdjointMap() @ moved)
     known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
     ways = by_velocity, by_acceleration, moved
-    return ScanError(*found, *scattered, *ways, offset, known, since_last)
+    return ScanError(*found, *scattered, *ways, offset, known, _since_last(solution, between))
 
 
-def _shares(
-    bread: FloatArray, priors: FloatArray, expected: FloatArray, weak: FloatArray,
-    between: MotionPrior | None,
-) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:  # fmt: skip
-    """``user`` and ``expected``, and ``since_last`` of a :class:`ScanError`.
-
-    ``bread`` (6, 6) is the covariance of the solution, ``priors`` the information of all but the
-    matches, the ``expected`` motion's included, and ``weak`` the projector on what is degenerate.
-    """
-    keep, since = np.eye(6) - weak, np.zeros((6, 6)) if between is None else between.information
-    others = keep.T @ priors @ keep + weak.T @ (priors - expected - since) @ weak
-    lasting = weak @ bread @ since @ bread @ weak.T
-    return (bread @ others, bread @ expected), symmetric(lasting)
+def _since_last(solution: Solution, between: MotionPrior | None) -> FloatArray:
+    """``since_last`` of a :class:`ScanError`; elsewhere the scan draws the pose back to the map."""
+    if between is None or solution.weak is None:
+        return np.zeros((6, 6))
+    along = solution.weak @ np.linalg.inv(solution.information)
+    return symmetric(_through(along, between.information))
 
 
 def _as_solved(

@@ -123,7 +123,8 @@ def undisturbed() -> list[np.ndarray]:
     [
         ("factors", 2, 0, "extra_factors"),
         ("residual", 2, 0, "extra_factors"),
-        ("residual", 2, 1, "solver"),
+        ("residual", 2, 1, "extra_factors"),
+        ("residual", 2, 2, "solver"),
         ("solver", 1, 1, "solver"),
         ("solver", 4, 2, "solver"),
         ("indeterminate", 2, 0, "solver"),

@@ -343,7 +343,7 @@ def _times_from_azimuth(
     columns: SweepColumns, rings: RingAssignment, sensor: SensorConfig
 ) -> TimeAssignment:
     """Times in proportion to the angle turned since the start of the sweep, about its axis."""
-    azimuths = azimuths_about_axis(columns.xyz, rings.rings)
+    azimuths = azimuths_about_axis(columns.xyz, rings.rings, columns.azimuth)
     order = slice(None) if rings.ring_major else np.argsort(rings.rings, kind="stable")
     same_ring = np.diff(rings.rings[order]) == 0
     azimuth = azimuths[order]

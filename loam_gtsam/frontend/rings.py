@@ -114,9 +114,9 @@ def are_level(xyz: NDArray[np.float32], ring_starts: IntArray) -> bool:
 
 
 def azimuths_about_axis(
-    xyz: NDArray[np.float32], rings: NDArray[np.integer]
+    xyz: NDArray[np.float32], rings: NDArray[np.integer], about_z: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(N,) rad, of points (3, N) about the axis of their rings (N,), or about z if that is it.
+    """(N,) rad, of points (3, N) about the axis of their rings (N,), or ``about_z`` if that is it.
 
     A beam that turns sees all its points at one angle from the axis: directions scatter least
     along it. Azimuths are those about z after the shortest turn of the axis to z.
@@ -129,10 +129,11 @@ def azimuths_about_axis(
     apart = directions - means[:, numbers]
     scatter, axes = np.linalg.eigh(apart @ apart.T)
     axis = axes[:, 0] * np.copysign(1.0, axes[2, 0])
-    if axis[2] < np.cos(_ASKEW) and scatter[0] < _SHARP * scatter[1]:
-        turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [axis])[0].as_matrix()
-        xyz = turn.astype(np.float32) @ xyz
-    azimuths: NDArray[np.float32] = np.arctan2(xyz[1], xyz[0])
+    if axis[2] >= np.cos(_ASKEW) or scatter[0] >= _SHARP * scatter[1]:
+        return about_z
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [axis])[0].as_matrix()
+    x, y, _ = turn.astype(np.float32) @ xyz
+    azimuths: NDArray[np.float32] = np.arctan2(y, x)
     return azimuths
 
 

@@ -242,15 +242,14 @@ class Path:
 
 def check_placed(updates: Sequence[MapUpdate]) -> None:
     """InputError for frames whose poses mean nothing: none was solved, or the first are lost."""
-    solved = [number for number, update in enumerate(updates) if update.status.solved]
-    begins = any(update.status is FrameStatus.FIRST for update in updates)
-    if not solved and len(updates) > 1:
+    statuses = [update.status for update in updates]
+    begin = next((number for number, status in enumerate(statuses) if status.solved), 0)
+    if len(updates) > 1 and not any(status.solved for status in statuses):
         raise InputError(f"updates: expected frames that were solved, got none of {len(updates)}")
-    lost = any(one.status is FrameStatus.LOST for one in updates[: solved[0] if solved else 0])
-    if lost and not begins:
+    if FrameStatus.LOST in statuses[:begin] and FrameStatus.FIRST not in statuses:
         raise InputError(
-            f"updates: the first {solved[0]} frames were not found in a map (localise), and their "
-            f"poses mean nothing; give dataset.part({solved[0]}) and updates[{solved[0]}:]"
+            f"updates: the first {begin} frames were not found in a map (localise), and their "
+            f"poses mean nothing; give dataset.part({begin}) and updates[{begin}:]"
         )
 
 

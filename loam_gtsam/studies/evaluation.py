@@ -296,9 +296,10 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     inside = [n for n, u in enumerate(updates) if u.status.has_pose and first <= u.stamp <= last]
     if not inside:
         raise InputError(f"nees: expected poses inside {first} to {last} ns, got none")
-    begun = FrameStatus.FIRST, *(status for status in FrameStatus if status.solved)
-    placed = [n for n in inside if updates[n].status in begun]  # none before the fix of localise
-    inside = [n for n in inside if not placed or n >= placed[0]]
+    statuses = {n: updates[n].status for n in inside}
+    placed = (n for n, status in statuses.items() if status.solved or status is FrameStatus.FIRST)
+    begin = next(placed, inside[0])  # none is placed before the fix of localise
+    inside = [n for n in inside if n >= begin]
     chosen = [updates[n] for n in inside]
     truth = reference.at([update.stamp for update in chosen])
     _need_orientation("nees", truth.map_T_lidar)

@@ -499,5 +499,6 @@ def test_rings_that_have_no_axis_leave_azimuths_as_they_are() -> None:
     """As the arcs of a rosette, whose numbers are those of its beams."""
     rng = np.random.default_rng(2)
     xyz = rng.normal(size=(3, 600)).astype(np.float32)
-    azimuths = azimuths_about_axis(xyz, np.arange(600) % 6)
+    about_z = np.arctan2(xyz[1], xyz[0])
+    azimuths = azimuths_about_axis(xyz, np.arange(600) % 6, about_z)
     np.testing.assert_array_equal(azimuths, np.arctan2(xyz[1], xyz[0]))

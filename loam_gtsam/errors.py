@@ -5,15 +5,18 @@ from __future__ import annotations
 import copyreg
 import difflib
 import logging
+import math
 import os
 import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
+from numbers import Real
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,16 +63,32 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
 
 
-def check_path(value: object, name: str) -> None:
-    """InputError for anything but a text or a path."""
+def check_all(values: object, kind: type, name: str, how: str) -> None:
+    """InputError for anything but a sequence of values of a class; ``how`` says what makes one."""
+    check_kind(values, Sequence, name, how)
+    assert isinstance(values, Sequence)  # for the type checker
+    for number, value in enumerate(values):
+        check_kind(value, kind, f"{name}[{number}]", how)
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a real number, infinite at most."""
+    return isinstance(value, Real) and not math.isnan(value)
+
+
+def as_path(value: object, name: str = "path") -> Path:
+    """A path; InputError for anything but a text or a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise InputError(f"{name}: expected a path, got {type(value).__name__}")
+    return Path(value)
 
 
-def check_count(value: object, name: str) -> None:
-    """InputError for anything but a whole number, not negative, or None."""
-    if value is not None and not (isinstance(value, (int, np.integer)) and value >= 0):
-        raise InputError(f"{name}: expected a whole number, 0 or more, or None, got {value!r}")
+def check_count(value: object, name: str, *, optional: bool = False) -> None:
+    """InputError for anything but a whole number, not negative; None is one if it is optional."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0
+    if not (whole or (optional and value is None)):
+        wanted = "a whole number, 0 or more" + (", or None" if optional else "")
+        raise InputError(f"{name}: expected {wanted}, got {value!r}")
 
 
 def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
@@ -91,7 +110,7 @@ def are_two_numbers(value: object) -> bool:
     return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
 
 
-def check_unmasked(value: object, name: str) -> None:
+def _check_unmasked(value: object, name: str) -> None:
     """InputError for an array of ``numpy.ma``, whose mask would be lost."""
     if isinstance(value, np.ma.MaskedArray):
         raise InputError(
@@ -106,10 +125,11 @@ def check_array(
     """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
 
     A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
-    integers or floats, the array must hold these.
+    integers, floats or flags, the array must hold these.
     """
-    check_unmasked(value, name)
-    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
+    _check_unmasked(value, name)
+    named = {"integer": "iu", "float": "f", "flag": "b"}
+    kinds = next((kinds for name, kinds in named.items() if name in numbers), "fiu")
     got = type(value).__name__
     if isinstance(value, np.ndarray):
         same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
@@ -122,13 +142,18 @@ def check_array(
     raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
 
 
-def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
-    """(N,) int64 nanoseconds; InputError for anything but integers."""
-    check_unmasked(value, name)
+def as_one_array(value: ArrayLike, name: str) -> NDArray[Any]:
+    """What numpy makes of it; InputError if that is no array, or one with a mask."""
+    _check_unmasked(value, name)
     try:
-        stamps = np.asarray(value)
+        return np.asarray(value)
     except ValueError as error:
         raise InputError(f"{name}: expected an array, got {error}") from error
+
+
+def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
+    """(N,) int64 nanoseconds; InputError for anything but integers."""
+    stamps = as_one_array(value, name)
     if not stamps.size:
         stamps = stamps.astype(np.int64)
     elif stamps.dtype == np.uint64 and stamps.max() > np.iinfo(np.int64).max:

@@ -42,6 +42,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loam_gtsam.errors import check_all, check_kind, is_number
 from loam_gtsam.geometry import as_array, as_points, as_unit, as_vector, cross
 from loam_gtsam.types import BoolArray, FloatArray, InputError, check_array
 
@@ -187,7 +188,10 @@ def plane_rows(
 
 
 def concatenate_rows(parts: Sequence[MatchRows]) -> MatchRows:
-    """All rows of several sets of matches."""
+    """All rows of several sets of matches, at least one."""
+    check_all(parts, MatchRows, "parts", "line_rows and plane_rows make them")
+    if not parts:
+        raise InputError("parts: expected at least one set of rows, got none")
     names = ("points", "normals", "offsets", "scales")
     return MatchRows(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
 
@@ -218,9 +222,9 @@ def checked_factor(
     rows = noise_dimension(noise)
     if not isinstance(keys, Sequence):
         raise InputError(f"keys: expected a list of keys, got {type(keys).__name__} {keys!r}")
+    keys = [_checked_key(key) for key in keys]
     if not callable(residual):
         raise InputError(f"residual: expected a function, got {type(residual).__name__}")
-    keys = list(keys)
 
     def call(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -273,8 +277,8 @@ def point_to_plane_factor(
         If a shape is wrong, a value not finite, or the normal not of unit length.
     """
     p, n = as_vector(point, "point"), as_unit(normal, "normal")
-    if not np.isfinite(offset):
-        raise InputError(f"offset: expected a finite number, got {offset}")
+    if not (is_number(offset) and np.isfinite(offset)):
+        raise InputError(f"offset: expected a finite number, got {offset!r}")
     noise_dimension(noise, 1)
     residual = partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
     return _pose_factor(key, noise, residual)
@@ -325,6 +329,7 @@ def scan_match_residual(
     rows: MatchRows,
 ) -> Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]:
     """The function of a pose behind :func:`scan_match_factor`: residual (13,), Jacobian (13, 6)."""
+    check_kind(rows, MatchRows, "rows", "match_rows(matches) makes them")
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")
     anchor, root = _compressed(rows)
@@ -403,7 +408,13 @@ def _pose_factor(
             jacobians[0] = np.asfortranarray(derivative)
         return error
 
-    return gtsam.CustomFactor(noise, [key], call)
+    return gtsam.CustomFactor(noise, [_checked_key(key)], call)
+
+
+def _checked_key(key: object) -> int:
+    if not isinstance(key, (int, np.integer)) or key < 0:
+        raise InputError(f"key: expected a whole number, as gtsam.symbol('x', 7) is, got {key!r}")
+    return int(key)
 
 
 def _dimension(values: gtsam.Values, key: int) -> int:

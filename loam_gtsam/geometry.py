@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, ndtr
 
+from loam_gtsam.errors import as_one_array
 from loam_gtsam.errors import as_stamps as as_stamps
-from loam_gtsam.errors import check_unmasked
 from loam_gtsam.trajectory import checked_pose as checked_pose
 from loam_gtsam.trajectory import is_rigid as is_rigid
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
@@ -35,11 +35,7 @@ def five_sigma(freedoms: int) -> float:
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
     """Anything that numpy makes a finite array of, as float64; checked by :func:`check_array`."""
-    check_unmasked(value, name)
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise InputError(f"{name}: expected an array, got {error}") from error
+    array = as_one_array(value, name)
     check_array(array, name, shape, "numbers")
     finite = np.isfinite(array)
     if not finite.all():

@@ -85,7 +85,8 @@ class Mapper:
 
     Parameters
     ----------
-    config : ``map``, ``matching``, ``solver``, ``deskew`` and ``imu`` of it are used
+    config : of the sections about front end and sensor, only what is said of errors is used; those
+        about odometry, loops and files are not
     solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`; its settings,
         ``solver.config``, replace ``config.solver``. If None, :func:`make_solver` makes it
     imu : samples may be added to it while the mapper runs
@@ -114,7 +115,7 @@ class Mapper:
         extra_factors: ExtraFactors | None = None,
     ) -> None:
         self.config = _with_settings_of(solver, as_config(config))
-        self.solver = solver or make_solver(self.config.solver)
+        self.solver = make_solver(self.config.solver) if solver is None else solver
         imu = None if self.config.imu.coupling == "off" else imu
         _check_parts(self.config, solver, imu, extra_factors)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)

@@ -181,7 +181,7 @@ class Pipeline:
         self, config: Config | None = None, *, imu: ImuBuffer | None = None,
         wheels: WheelSamples | None = None, **parts: Unpack[Parts],
     ) -> None:  # fmt: skip
-        _check_parts(parts)
+        _check_parts(parts, Pipeline)
         self.config = as_config(config)
         self.faults = PartFaults(self.config.parts.on_error)
         solver, factors = parts.get("solver"), parts.get("extra_factors")
@@ -375,13 +375,13 @@ def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
     return None if samples is None else ImuBuffer(config.imu, samples)
 
 
-def _check_parts(parts: Mapping[str, object]) -> None:
-    """TypeError for a keyword that is none, which a TypedDict lets pass; InputError for a part."""
+def _check_parts(parts: Mapping[str, object], of: Callable[..., object]) -> None:
+    """TypeError for a keyword that ``of`` does not have; InputError for a part that is none."""
     for name in parts:
-        if name in ("imu", "gnss", "wheels"):
+        if of is run and name in ("imu", "gnss", "wheels"):
             raise TypeError(f"{name}: the data set has it, as ArrayDataset(..., {name}=...)")
         if name not in Parts.__annotations__:
-            hint = nearest(name, [*Parts.__annotations__, *list(signature(run).parameters)[:-1]])
+            hint = nearest(name, [*Parts.__annotations__, *list(signature(of).parameters)[:-1]])
             raise TypeError(f"unexpected keyword argument {name!r}{hint}")
     check_part(parts.get("features"), "features", "a function", "__call__")
     check_part(parts.get("odometry"), "odometry", "an object", "guess", "remember", "reset")
@@ -427,8 +427,8 @@ def run(
     PartError
         If a part of your own raises, an observer included, and ``parts.on_error`` is ``stop``.
     """
-    _check_parts(parts)
-    check_count(max_frames, "max_frames")
+    _check_parts(parts, run)
+    check_count(max_frames, "max_frames", optional=True)
     check_count(workers, "workers")
     config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
 
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 _OF_FILES = 1e-2  # by which the axes of a rotation may be off in a file, which has few digits
 _OF_POSES = 1e-5  # and in a pose that a user gives
 
@@ -35,20 +37,21 @@ class Trajectory:
         If there is not one pose for each stamp, or a matrix without NaN is no pose.
     """
 
-    stamps: NDArray[np.int64]
-    map_T_lidar: NDArray[np.float64]
-    point: NDArray[np.float64] | None = None
+    stamps: IntArray
+    map_T_lidar: FloatArray
+    point: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        check_array(self.stamps, "Trajectory.stamps", ("N",), "integer nanoseconds")
+        object.__setattr__(self, "stamps", as_stamps(self.stamps, "Trajectory.stamps"))
         check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")
         check_poses(self.map_T_lidar, "Trajectory.map_T_lidar")
 
     @classmethod
     def from_poses(
-        cls, stamps: Sequence[int] | NDArray[np.int64], poses: Iterable[gtsam.Pose3]
+        cls, stamps: Sequence[int] | IntArray, poses: Iterable[gtsam.Pose3]
     ) -> Trajectory:
         """N poses at N stamps in nanoseconds; InputError for anything else."""
+        check_kind(poses, Iterable, "poses", "a list of gtsam.Pose3 is one")
         poses = list(poses)
         for number, pose in enumerate(poses):
             how = "Trajectory(stamps, matrices) takes an array of (N, 4, 4)"
@@ -81,7 +84,7 @@ class Trajectory:
         return f"Trajectory({len(self)} poses: {path})"
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> FloatArray:
         """(N, 3) metres, a view of ``map_T_lidar``."""
         return self.map_T_lidar[:, :3, 3]
 
@@ -119,7 +122,7 @@ class Trajectory:
         found = self._interpolated(asked)
         return found[0] if np.ndim(stamps) == 0 else found
 
-    def _interpolated(self, stamps: NDArray[np.int64]) -> Trajectory:
+    def _interpolated(self, stamps: IntArray) -> Trajectory:
         from scipy.spatial.transform import Rotation, Slerp
 
         times, queries = ((some - self.stamps[0]) * 1e-9 for some in (self.stamps, stamps))
@@ -135,7 +138,7 @@ class Trajectory:
         return Trajectory(stamps, poses, self.point)
 
 
-def stack_poses(poses: Iterable[gtsam.Pose3]) -> NDArray[np.float64]:
+def stack_poses(poses: Iterable[gtsam.Pose3]) -> FloatArray:
     """(N, 4, 4) matrices of N poses; (0, 4, 4) if there are none."""
     return np.array([pose.matrix() for pose in poses], np.float64).reshape(-1, 4, 4)
 

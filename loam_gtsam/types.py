@@ -28,248 +28,23 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
-from loam_gtsam.errors import are_two_numbers, as_stamps
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
+from loam_gtsam.sweeps import MAX_STAMP as MAX_STAMP
+from loam_gtsam.sweeps import BadSweep as BadSweep
+from loam_gtsam.sweeps import Features as Features
+from loam_gtsam.sweeps import FeatureSweep as FeatureSweep
+from loam_gtsam.sweeps import ImuSamples as ImuSamples
+from loam_gtsam.sweeps import Scan as Scan
+from loam_gtsam.sweeps import Sweep as Sweep
+from loam_gtsam.trajectory import FloatArray as FloatArray
+from loam_gtsam.trajectory import IntArray as IntArray
 from loam_gtsam.trajectory import Trajectory as Trajectory
-from loam_gtsam.trajectory import checked_pose
 from loam_gtsam.trajectory import stack_poses as stack_poses
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 TANGENT = ("rx", "ry", "rz", "x", "y", "z")
 """Names of the six components of a tangent vector of a pose: rad, then metres."""
-MAX_STAMP = 1 << 62
-"""Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
-_FARTHEST = 1e5
-"""Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scan:
-    """One sweep of the sensor, as it was measured (not de-skewed).
-
-    Parameters
-    ----------
-    points : (N, 3) floats, metres, lidar frame. NaN and infinite rows are allowed.
-    stamp : nanoseconds; ``times`` count from here.
-    times : (N,) seconds from ``stamp`` at which each point was measured, or None if unknown.
-    rings : (N,) integer beam number of each point, or None if unknown. Any consistent order.
-    span : (first, last) seconds from ``stamp`` covered by the whole sweep. When None, the
-        smallest and largest of ``times`` are used.
-    rows : number of rows if the points are a full row-major range image (``rows`` x columns),
-        else 0.
-
-    Raises
-    ------
-    InputError
-        If a shape or a dtype is wrong.
-    """
-
-    points: NDArray[np.floating]
-    stamp: int
-    times: NDArray[np.floating] | None = None
-    rings: NDArray[np.integer] | None = None
-    span: tuple[float, float] | None = None
-    rows: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("points", "times", "rings"):
-            if isinstance(given := getattr(self, name), (list, tuple)):
-                object.__setattr__(self, name, np.array(given))
-        check_array(self.points, "Scan.points", ("N", 3))
-        _check_stamp(self)
-        for name, numbers in (("times", "floats"), ("rings", "integers")):
-            column = getattr(self, name)
-            if column is not None:
-                check_array(column, f"Scan.{name}", (len(self.points),), numbers)
-        if self.span is not None:
-            if not are_two_numbers(self.span):
-                raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
-            object.__setattr__(self, "span", tuple(map(float, self.span)))
-        if not (_is_integer(self.rows) and self.rows >= 0):
-            raise InputError(f"Scan.rows: expected a number of rows, or 0, got {self.rows!r}")
-        if self.rows and len(self.points) % self.rows:
-            raise InputError(
-                f"Scan.rows: {len(self.points)} points do not divide into {self.rows} rows"
-            )
-
-
-def _is_integer(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
-def _check_stamp(sweep: Scan | Features | BadSweep) -> None:
-    """InputError unless the stamp makes sense, which becomes an int; any may do for a bad sweep."""
-    stamp = sweep.stamp
-    bounded = not isinstance(sweep, BadSweep)
-    if not _is_integer(stamp) or (bounded and abs(int(stamp)) > MAX_STAMP):
-        raise InputError(
-            f"{type(sweep).__name__}.stamp: expected integer nanoseconds up to 2^62 (the year "
-            f"2116), got {stamp!r}; round(seconds * 1e9) makes them of seconds"
-        )
-    object.__setattr__(sweep, "stamp", int(stamp))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Features:
-    """Edge and plane points of one sweep, at the positions they were measured (not de-skewed).
-
-    Attributes
-    ----------
-    stamp : nanoseconds of the reference time, the time the pose of this frame belongs to.
-    edges, planes : (E, 3) and (P, 3) float64, metres, lidar frame at each point's own time.
-    edge_times, plane_times : seconds from ``stamp``; all zero if already de-skewed.
-    edge_rings, plane_rings : integer beam numbers.
-    level_rings : whether beams sweep rings about the lidar's z axis, which edges cross. Those of a
-        Livox swing up and down, and a lidar that is mounted askew has others
-    sharp, flat : indices of the most pronounced edges and planes, for scan-to-scan odometry.
-    span : (first, last) seconds from ``stamp`` covered by the sweep.
-    edge_prominence : (E,) metres by which an edge stands out of its ring, scaled so that range
-        noise alone gives it the standard deviation of the noise
-        (:func:`loam_gtsam.frontend.curvature.prominence`); None if unknown: all edges are real
-    edge_sigmas : (E,) metres, standard deviation of the place of an edge along its ring, for beams
-        are apart, and pass beside the edge itself; None if unknown: edges are where they were met
-    not_finite : points of the sweep that were NaN or infinite
-    voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
-        point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points.
-    reach : metres; three quarters of the points of the sweep are nearer, which tells whether the
-        place is small (``map.small_below``). Infinite if unknown: the place then counts as open.
-    ring_elevations : (R,) rad, mean elevations of rings about the lidar's z axis; None if unknown
-    """
-
-    stamp: int
-    edges: FloatArray
-    planes: FloatArray
-    edge_times: FloatArray
-    plane_times: FloatArray
-    edge_rings: IntArray
-    plane_rings: IntArray
-    sharp: IntArray
-    flat: IntArray
-    span: tuple[float, float] = (0.0, 0.0)
-    edge_prominence: FloatArray | None = None
-    edge_sigmas: FloatArray | None = None
-    level_rings: bool = True
-    not_finite: int = 0
-    voxel_sizes: tuple[float, float] | None = None
-    reach: float = np.inf
-    ring_elevations: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        _check_stamp(self)
-
-    @classmethod
-    def from_points(
-        cls, stamp: int, edges: NDArray[np.floating], planes: NDArray[np.floating]
-    ) -> Features:
-        """Features, (E, 3) and (P, 3) floats, that are de-skewed already, by another front end.
-
-        Raises
-        ------
-        InputError
-            If a shape, a dtype or the stamp is wrong, or a point is not finite or farther than any
-            lidar sees.
-        """
-        for name, points in {"edges": edges, "planes": planes}.items():
-            check_array(points, name, ("N", 3))
-            wild = int(np.count_nonzero(~(np.abs(points) < _FARTHEST).all(axis=1)))
-            if wild:
-                raise InputError(
-                    f"{name}: expected metres below {_FARTHEST:g}, got {wild} points of "
-                    f"{len(points)} that are NaN, infinite or farther; remove them first"
-                )
-        edge_numbers, plane_numbers = np.arange(len(edges)), np.arange(len(planes))
-        return cls(
-            stamp,
-            edges.astype(np.float64),
-            planes.astype(np.float64),
-            edge_times=np.zeros(len(edges)),
-            plane_times=np.zeros(len(planes)),
-            edge_rings=np.zeros_like(edge_numbers),
-            plane_rings=np.zeros_like(plane_numbers),
-            sharp=edge_numbers,
-            flat=plane_numbers,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FeatureSweep:
-    """Features and odometry of one sweep made by another front end (e.g. LOAM's own topics).
-
-    Attributes
-    ----------
-    features : de-skewed features
-    odom_T_lidar : pose of the same moment in that front end's drifting frame
-    cloud : (N, 3) de-skewed full-resolution points of the same moment, or None
-    """
-
-    features: Features
-    odom_T_lidar: gtsam.Pose3
-    cloud: NDArray[np.floating] | None = None
-
-    def __post_init__(self) -> None:
-        check_kind(self.features, Features, "FeatureSweep.features", "from_points makes them")
-        checked_pose(self.odom_T_lidar, "FeatureSweep.odom_T_lidar")
-
-    @property
-    def stamp(self) -> int:
-        """Of the features."""
-        return self.features.stamp
-
-
-@dataclass(frozen=True, slots=True)
-class BadSweep:
-    """A sweep its loader could not read; the run goes on with a predicted pose."""
-
-    stamp: int
-    message: str
-
-    def __post_init__(self) -> None:
-        _check_stamp(self)
-
-
-Sweep = Scan | FeatureSweep | BadSweep
-"""What a data set yields."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuSamples:
-    """A stretch of IMU data.
-
-    Attributes
-    ----------
-    stamps : (N,) int64 nanoseconds
-    orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), NaN where unknown, or
-        None if the IMU has no attitude output
-    gyro : (N, 3) rad/s, imu frame
-    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest; zero for an IMU without an
-        accelerometer, which None or nothing stands for
-
-    Raises
-    ------
-    InputError
-        If a shape or a dtype is wrong.
-    """
-
-    stamps: IntArray
-    orientation: FloatArray | None
-    gyro: FloatArray
-    acceleration: FloatArray = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        stamps = as_stamps(self.stamps, "ImuSamples.stamps")
-        object.__setattr__(self, "stamps", stamps)
-        if self.acceleration is None:
-            object.__setattr__(self, "acceleration", np.zeros((len(stamps), 3)))
-        columns = {"orientation": 4, "gyro": 3, "acceleration": 3}
-        if self.orientation is None:
-            del columns["orientation"]
-        for name, width in columns.items():
-            column = np.asanyarray(getattr(self, name))
-            check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
-            object.__setattr__(self, name, np.asarray(column))
 
 
 class FrameStatus(StrEnum):
@@ -422,7 +197,7 @@ class MapUpdate:
     fault : what was wrong with the sweep, if the status is ``UNUSABLE_SCAN`` or ``BAD_STAMP``
     n_not_finite : points of the sweep that were NaN or infinite, if it was used
     map_T_middle, middle_stamp : pose and nanoseconds of the middle of the sweep, to which matches,
-        priors and own factors belong; None and 0 if nothing was matched
+        priors and own factors belong; None and 0 if the sweep was not used
     """
 
     stamp: int

@@ -515,6 +515,8 @@ def test_a_predicted_pose_teaches_nothing_about_the_gyro():
         planes=features.planes[:20],
         plane_times=features.plane_times[:20],
         plane_rings=features.plane_rings[:20],
+        sharp=features.sharp[:0],
+        flat=features.flat[:0],
         voxel_sizes=None,
     )
     assert mapper.register(few).status is FrameStatus.FEW_MATCHES

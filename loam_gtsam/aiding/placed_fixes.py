@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.geometry import cross_matrix
+from loam_gtsam.geometry import as_vector, cross_matrix
 from loam_gtsam.loops.keyframes import noise_model, pose_key
 from loam_gtsam.types import FloatArray, IntArray, stack_poses
 
@@ -182,6 +182,7 @@ def fix_factor(
     noise : of its three rows
     keyframe_T_lidar : the lidar at the moment of the fix, seen from the keyframe
     """
+    enu = as_vector(enu, "enu")
     moved = gtsam.Pose3() if keyframe_T_lidar is None else keyframe_T_lidar
     turned, start = moved.rotation().matrix(), moved.translation()
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from loam_gtsam.config import AidingConfig, Config
 from loam_gtsam.datasets.decode.aiding import WheelSamples
+from loam_gtsam.errors import check_kind
 from loam_gtsam.registration.odometry import ConstantVelocity, Guess, Odometry, Turns
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import ConfigError, Features, FrameStatus, MapUpdate
@@ -34,10 +35,10 @@ class _Step(NamedTuple):
 class WheelOdometry(Odometry):
     """Predicts the sweeps by the wheels: how far; the gyro says which way, if there is one.
 
-    Along directions that a scan does not fix the prediction stays (:class:`~loam_gtsam.MotionPrior`
-    in docs/maths/degeneracy.md); everywhere else the scan decides, and so wheels that slip bend
-    nothing. The covariance along such directions is that of a constant velocity, which is wider
-    than that of wheels.
+    Along directions that a scan does not fix the prediction stays
+    (:class:`~loam_gtsam.registration.solvers.MotionPrior`); everywhere else the scan decides, and
+    so wheels that slip bend nothing. The covariance along such directions is that of a constant
+    velocity, which is wider than that of wheels.
 
     Parameters
     ----------
@@ -157,6 +158,7 @@ def aided_odometry(
             "aiding.wheels: expected the odometry of the wheels, got none; give it to Pipeline as "
             "wheels=WheelSamples(...), or leave aiding.wheels out"
         )
+    check_kind(wheels, WheelSamples, "wheels", "WheelSamples(stamps, start_T_body) makes one")
     if imu is not None and config.imu.coupling == "tight":
         raise ConfigError(
             "aiding.wheels: with imu.coupling tight the accelerometer predicts, not the wheels; "

@@ -232,13 +232,16 @@ def nested(changes: Iterable[str | Mapping[str, Any]], where: str) -> dict[str, 
     """Changes as :meth:`Config.changed` takes them, as mappings within mappings for `override`."""
     tree: dict[str, Any] = {}
     for change in changes:
+        if not isinstance(change, (str, Mapping)):
+            wanted = '"section.key=value" or {"section.key": value}'
+            raise ConfigError(f"{where}expected {wanted}, got {type(change).__name__}")
         _merge(tree, assignment(change, where) if isinstance(change, str) else change)
     return tree
 
 
 def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
     for key, value in change.items():
-        name, dot, rest = key.partition(".")
+        name, dot, rest = str(key).partition(".")
         if dot:
             value = {rest: value}
         if isinstance(value, Mapping):

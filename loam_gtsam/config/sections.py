@@ -60,7 +60,8 @@ class FeatureConfig(Section):
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
     beam_width: float = parameter(1e-3, unit="rad", source="half of data sheets", low=0.0, high=1.0)
-    """Edges before drops are moved outwards by half of the gap between beams of this width."""
+    """Edges before drops are moved outwards by half of the gap between beams of this width; 1 turns
+    this off."""
     range_noise: float = parameter(0.02, unit="m", source="LOAM takes all that is no edge", low=0.0)
     """The ranges of the sensor have this standard deviation. A plane point lies where its ring
     scatters by less than four times this about a smooth surface; 0 turns the test off."""
@@ -283,8 +284,8 @@ class SolverConfig(Section):
     kernel_width: float = parameter(
         1.345, source="95 % efficiency on normal noise", low=0.1, high=math.inf
     )
-    """The Huber kernel on the matches has this width, in units of their scatter; .inf turns it off.
-    The Geman-McClure kernel is 2.816 times as wide, which makes the two alike on normal noise."""
+    """The Huber kernel on the matches has this width, in units of their scatter; the Geman-McClure
+    kernel is 2.816 times as wide, which makes the two alike on normal noise. .inf is no kernel."""
     step_sigmas: float = parameter(0.5, low=0.0)
     """The solve stops as well when an association moves the pose by less than this many of its
     standard deviations; 0 turns this rule off."""

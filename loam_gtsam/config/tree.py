@@ -26,7 +26,7 @@ from loam_gtsam.config.base import (
 )
 from loam_gtsam.config.output import BagConfig, LiveConfig
 from loam_gtsam.config.own_parts import PartsConfig
-from loam_gtsam.errors import check_kind, check_path, nearest
+from loam_gtsam.errors import as_path, check_kind, nearest
 from loam_gtsam.types import ConfigError, InputError
 
 
@@ -243,7 +243,7 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
 
 def config_to_dict(config: Config) -> dict[str, Any]:
     """Nested plain dictionaries; the inverse of :func:`config_from_dict`."""
-    return config.model_dump()
+    return as_config(config).model_dump()
 
 
 def load_config(path: str | Path) -> Config:
@@ -254,9 +254,9 @@ def load_config(path: str | Path) -> Config:
     ConfigError
         If the file cannot be read, is not YAML, or does not fit.
     """
-    check_path(path, "path")
+    path = as_path(path)
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error  # without the path again
         raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
@@ -281,7 +281,7 @@ def dump_config(config: Config) -> str:
     yaml = YAML()
     yaml.width = _WIDTH
     out = io.StringIO()
-    yaml.dump(_commented(config, 0), out)
+    yaml.dump(_commented(as_config(config), 0), out)
     return out.getvalue()
 
 

@@ -17,7 +17,7 @@ from loam_gtsam.datasets.base import BagOptions, LoadedDataset
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets.known.layouts import known_loader
-from loam_gtsam.errors import check_path, nearest
+from loam_gtsam.errors import as_path, nearest
 from loam_gtsam.types import DatasetError
 from loam_gtsam.types import Sweep as Sweep
 
@@ -94,7 +94,7 @@ def open_dataset(path: str | Path, **options: Any) -> LoadedDataset:
     DatasetError
         If nothing is there, it is of no known kind, or an option does not belong to it.
     """
-    check_path(path, "path")
+    as_path(path)
     options = {key: value for key, value in options.items() if value is not None}
     text = str(path)
     if text.startswith("sim:"):

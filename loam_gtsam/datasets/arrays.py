@@ -12,6 +12,7 @@ from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import shorter_period, span_problem, usual_step
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
+from loam_gtsam.errors import check_all, check_kind
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import (
     MAX_STAMP,
@@ -20,7 +21,6 @@ from loam_gtsam.types import (
     IntArray,
     Scan,
     Trajectory,
-    check_kind,
 )
 
 _LATEST = MAX_STAMP * 1e-9  # seconds
@@ -73,6 +73,9 @@ class ArrayDataset(Loader):
         name: str = "arrays",
         sensor: Mapping[str, Any] | None = None,
     ) -> None:
+        check_kind(scans, Iterable, "scans", "a list of arrays, or of Scan objects, is one")
+        if sensor is not None:
+            check_kind(sensor, Mapping, "sensor", '{"min_range": 2.0} is one')
         entries = list(scans)
         for part, given in {"imu": imu, "truth": truth, "gnss": gnss, "wheels": wheels}.items():
             if given is not None:
@@ -118,13 +121,13 @@ class ArrayDataset(Loader):
 
 def _ready(entries: Sequence[Any], columns: Sequence[Any]) -> list[Scan]:
     """Scans as they are given."""
-    scans = [entry for entry in entries if isinstance(entry, Scan)]
-    if len(scans) != len(entries) or any(column is not None for column in columns):
+    check_all(entries, Scan, "scans", "give either Scan objects alone or arrays alone")
+    if any(column is not None for column in columns):
         raise InputError(
-            "scans: Scan objects carry their own stamps, times and rings; give only Scan "
-            "objects and none of stamps, stamps_s, times, rings"
+            "scans: Scan objects carry their own stamps, times and rings; give none of stamps, "
+            "stamps_s, times, rings"
         )
-    return scans
+    return list(entries)
 
 
 def _made(

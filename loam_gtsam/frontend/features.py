@@ -2,8 +2,8 @@
 
 The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in Real-time, RSS
 2014, section V.A, and the published code's scan registration): curvature along each ring of the
-raw sweep, rejection of occluded and grazing points, and picks by sector. Four things differ from
-the published code:
+raw sweep, rejection of occluded and grazing points, and picks by sector. What differs from the
+published code:
 
 * Picks are made for all sectors at once, edges before plane points. The published code goes sector
   by sector, so that which of two neighbours is picked can differ within half a window of a border.
@@ -11,6 +11,7 @@ the published code:
 * A plane point must lie where its ring is smooth (:func:`roughness`, ``features.range_noise``). In
   foliage five neighbours make a plane only by chance, and matches with such planes pull the pose
   towards the pose from which the map was first seen.
+* An edge before a drop stands between its beam and the next (:func:`ends_of_surfaces`).
 * Poles, which are too thin for the curvature, are edges (:mod:`loam_gtsam.frontend.poles`).
 * Plane points are averaged over runs along a ring (:func:`averaged_along_rings`). The published
   code averages those in a voxel, ``features.thinning: voxels``, where flat picks stand in
@@ -26,7 +27,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import SMALL, Config, MapConfig
+from loam_gtsam.config import SMALL, Config, MapConfig, as_config
 from loam_gtsam.frontend.beams import elevations_of, without_beam_errors
 from loam_gtsam.frontend.curvature import (
     UNIFORM_SIGMA,
@@ -80,6 +81,7 @@ def extract_features(scan: Scan, config: Config) -> Features:
         the message says what was found and what to set.
     """
     _keep_freed_memory()
+    config = as_config(config)
     sweep = without_beam_errors(organise(scan, config), config.sensor.beams)
     if not sweep.rings.known:
         return _without_rings(scan, config, sweep)

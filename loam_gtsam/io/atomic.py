@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from loam_gtsam.errors import check_path
+from loam_gtsam.errors import as_path
 from loam_gtsam.types import OutputError
 
 _log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     OutputError
         If the file cannot be written; ``path`` is then as it was.
     """
-    path = Path(path)
+    path = as_path(path)
     # The same folder, for a rename is atomic only within one file system.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -88,8 +88,7 @@ def _without_nan(value: Any) -> Any:
 
 def make_folder(directory: str | Path) -> Path:
     """Make a folder and check that files can be written there, else raise an OutputError."""
-    check_path(directory, "directory")
-    folder = Path(directory)
+    folder = as_path(directory, "directory")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.errors import DAMAGED, check_path
+from loam_gtsam.errors import DAMAGED, InputError, as_path, is_number
 from loam_gtsam.io.atomic import atomic_file, lock_folder, make_folder, unlock_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
@@ -81,8 +81,9 @@ class Checkpoint:
     """
 
     def __init__(self, folder: str | Path, *, seconds: float = 60.0, resume: bool = False) -> None:
-        check_path(folder, "folder")
-        self.folder, self.seconds = Path(folder), seconds
+        if not (is_number(seconds) and seconds >= 0.0):
+            raise InputError(f"seconds: expected a number, 0 or more, got {seconds!r}")
+        self.folder, self.seconds = as_path(folder, "folder"), seconds
         self._resume = resume
         self._warned = False
         self._parts: list[int] = []  # how many frames there were at each checkpoint

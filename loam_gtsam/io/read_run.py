@@ -9,7 +9,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.errors import DAMAGED
+from loam_gtsam.errors import DAMAGED, as_path
+from loam_gtsam.io.run_files import NO_STAMP
 from loam_gtsam.types import (
     DatasetError,
     FrameStatus,
@@ -33,7 +34,7 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
         If the file cannot be read, or is not one of
         :func:`~loam_gtsam.io.run_files.write_npz`.
     """
-    path = Path(path)
+    path = as_path(path)
     path = path / "run.npz" if path.is_dir() else path
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -59,7 +60,7 @@ def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
         uncertainty = Uncertainty(
             own=at["own_covariances"],
             shared=at["shared_covariances"],
-            follows=None if follows < 0 else follows,
+            follows=None if follows == NO_STAMP else follows,
             drift=at["drift_covariances"],
             residual_variance=float(at["residual_variances"]),
             effective_matches=float(at["effective_matches"]),
@@ -67,6 +68,7 @@ def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
             forgotten=at["forgotten"],
             in_doubt=bool(at["in_doubt"]),
         )
+    middle = at["map_T_middle"]
     return MapUpdate(
         int(at["stamps"]),
         gtsam.Pose3(at["map_T_lidar"]),
@@ -76,7 +78,7 @@ def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
         twist=at["twists"],
         acceleration=at["accelerations"],
         uncertainty=uncertainty,
-        map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
+        map_T_middle=gtsam.Pose3(middle) if np.isfinite(middle).all() else None,
         middle_stamp=int(at["middle_stamps"]),
         sweep_motion=SweepMotion(str(at["sweep_motions"])),
         tilt_prior=TiltPrior(str(at["tilt_priors"])),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import dump_config
+from loam_gtsam.errors import check_all, check_kind
 from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
 from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from loam_gtsam.pipeline import RunResult
 
 _NS = 10**9
+NO_STAMP = int(np.iinfo(np.int64).min)
+"""In ``run.npz``: there is no such frame."""
 _MAX_MESSAGES = 20  # in summary.json; run.npz has them all
 EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
 """Red, green, blue of the two kinds of map points in the PLY file."""
@@ -60,6 +63,7 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     rad m and m^2, along the axes of the lidar; empty where the frame was not solved. Frames with a
     bad stamp are left out.
     """
+    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
     rows, columns = np.triu_indices(6)
     names = [f"{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(rows, columns, strict=True)]
     lines = [",".join(("stamp_s", "status", *names))]
@@ -84,16 +88,19 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 
     docs/outputs.md lists the keys; :class:`loam_gtsam.types.MapUpdate` says what the values mean.
     """
+    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
     nothing = np.full((6, 6), np.nan)
     rest = np.nan, np.nan, np.full((6, 10), np.nan), np.full(10, np.nan)
     unknown = Uncertainty(nothing, nothing, None, nothing, *rest)
     parts = [update.uncertainty or unknown for update in updates]
-    follows = [-1 if part.follows is None else part.follows for part in parts]
+    follows = [NO_STAMP if part.follows is None else part.follows for part in parts]
+    nowhere = np.full((4, 4), np.nan)
+    middles = [nowhere if (pose := u.map_T_middle) is None else pose.matrix() for u in updates]
     names, seconds = stage_seconds(updates)
     arrays = {
         "stamps": _column(updates, "stamp", np.int64),
         "map_T_lidar": stack_poses(u.map_T_lidar for u in updates),
-        "map_T_middle": stack_poses(u.map_T_middle or u.map_T_lidar for u in updates),
+        "map_T_middle": np.array(middles).reshape(-1, 4, 4),
         "middle_stamps": _column(updates, "middle_stamp", np.int64),
         "status": _column(updates, "status", np.str_),
         "messages": _column(updates, "message", np.str_),
@@ -193,6 +200,9 @@ def write_run(
     if not hasattr(result, "updates"):
         got = type(result).__name__
         raise InputError(f"result: expected a RunResult, got {got}; write_run(result, directory)")
+    check_kind(dataset, str, "dataset", "it is a name for the records")
+    if extra is not None:
+        check_kind(extra, Mapping, "extra", "they are entries of the summary")
     folder = make_folder(directory)
     with suppress(OSError):  # what cannot be removed cannot be replaced, which is told then
         (folder / "summary.json").unlink(missing_ok=True)

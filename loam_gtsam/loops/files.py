@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.datasets.decode.tables import whole_number
+from loam_gtsam.errors import as_path
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import is_pose, pose_key, pose_number
@@ -52,7 +53,7 @@ def write_graph(path: str | Path, saved: SavedGraph | PoseGraph) -> None:
     OutputError
         If a file cannot be written, or the graph holds a factor that GTSAM cannot serialise.
     """
-    path = Path(path)
+    path = as_path(path)
     saved = saved.saved() if isinstance(saved, PoseGraph) else saved
     check_kind(saved, SavedGraph, "saved", "RunResult.loops.graph is a PoseGraph, which will do")
     (_write_g2o if _is_g2o(path) else _write_gtsam)(path, saved)
@@ -68,7 +69,7 @@ def read_graph(path: str | Path) -> SavedGraph:
     DatasetError
         If the file cannot be read, naming the line that does not fit.
     """
-    path = Path(path)
+    path = as_path(path)
     return _read_g2o(path) if _is_g2o(path) else _read_gtsam(path)
 
 

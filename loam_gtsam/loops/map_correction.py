@@ -28,6 +28,7 @@ class LoopMapping:
     Parameters
     ----------
     mapper : whose frames are given to :meth:`add`
+    config : the mapper's if None
     closer : a :class:`ScanLoopCloser` if None
 
     Attributes
@@ -38,7 +39,7 @@ class LoopMapping:
     def __init__(
         self, mapper: Mapper, config: Config | None = None, closer: LoopCloser | None = None
     ) -> None:
-        self._config = as_config(config)
+        self._config = mapper.config if config is None else as_config(config)
         self._mapper = mapper
         self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)

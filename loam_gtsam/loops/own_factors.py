@@ -60,7 +60,7 @@ class FactorGraph:
         Raises
         ------
         InputError
-            If there is no such keyframe, or the covariance is not positive definite.
+            If there is no such keyframe, or the covariance is not positive semi-definite.
         """
         where, noise = as_vector(position, "position"), noise_model(covariance, 3)
         self.add_factor(gtsam.GPSFactor(self._key(index), where, noise))

@@ -189,8 +189,8 @@ class PoseGraph(FactorGraph):
     def trajectory(self, updates: Sequence[MapUpdate], session: int = 0) -> Trajectory:
         """The frames of a run, corrected by the keyframes before and after each.
 
-        A frame keeps its motion from either keyframe; where the two disagree, they count in
-        proportion of time.
+        A frame keeps its motion from either keyframe. Where the two disagree, they count by the
+        drift between them and the frame as the run reported it; by time if it reported none.
 
         Parameters
         ----------

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, sweeps_of_run
-from loam_gtsam.errors import SweepError
+from loam_gtsam.errors import SweepError, as_path, check_kind
 from loam_gtsam.frontend.organise import organise
 from loam_gtsam.geometry import as_points, move_points, squared_norm
 from loam_gtsam.maps.map_file import SavedMap
@@ -146,7 +146,9 @@ def count_votes(points: FloatArray, sweeps: Iterable[View], config: Config) -> V
     along = off_plane + config.features.plane_voxel / np.sqrt(12.0)
     normals, flat = surfaces(points, off_plane / 3.0)
     free, seen = np.zeros((2, len(points)), np.int64)
+    check_kind(sweeps, Iterable, "sweeps", "views makes them")
     for view in sweeps:
+        check_kind(view, View, "sweeps", "views makes them")
         image = _Image.of(view)
         if image is None:
             continue
@@ -195,6 +197,9 @@ def clean_map(
     OutputError
         If the file cannot be written.
     """
+    check_kind(saved, SavedMap, "saved", "SavedMap(path) opens one")
+    path = as_path(path)
+    check_kind(config, Config, "config", "saved.config is that of the run")
     order = [(layer, index) for layer, cubes in saved.layers.items() for index in cubes]
     parts = [saved.cube(layer, index).points for layer, index in order]
     points = np.concatenate([np.empty((0, 3)), *parts])

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.datasets.decode.packed_points import read_pcd, read_ply
 from loam_gtsam.datasets.decode.pointcloud2 import read_positions
+from loam_gtsam.errors import as_path
 from loam_gtsam.geometry import as_points, squared_norm, voxel_filter
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.run_files import write_ply
@@ -57,7 +58,7 @@ def read_cloud(path: str | Path) -> FloatArray:
     DatasetError
         If it cannot be read, is of another kind, or needs a package that is not installed.
     """
-    path = Path(path)
+    path = as_path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         kinds = ", ".join(_READERS)
@@ -79,7 +80,7 @@ def write_cloud(path: str | Path, edges: FloatArray, planes: FloatArray) -> None
     OutputError
         If the file cannot be written, or the name ends otherwise.
     """
-    path, points = Path(path), np.concatenate([edges, planes])
+    path, points = as_path(path), np.concatenate([edges, planes])
     kind = path.suffix.lower()
     if kind == ".ply":
         write_ply(path, edges, planes)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
+from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig, as_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.errors import PartFaults, SweepFault, check_count, own_code
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
@@ -322,7 +322,7 @@ def own_settings(saved: SavedMap) -> Config:
 
 def config_in(saved: SavedMap, config: Config | None, *, extend: bool = False) -> Config:
     """The configuration of a mapper in a saved map, which it may extend."""
-    config, own = config or saved.config, saved.config
+    config, own = saved.config if config is None else as_config(config), saved.config
     shape = {name: getattr(own.loops, name) for name in ("rings", "sectors", "reach")}
     window = tuple(n + 2 * _BEYOND for n in own.map.neighbourhood)
     margin = max(own.map.neighbourhood) // 2
@@ -409,9 +409,10 @@ def localise(
         On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
     """
     check_kind(saved, SavedMap, "saved", "SavedMap(path) opens one")
-    check_count(max_frames, "max_frames")
+    check_count(max_frames, "max_frames", optional=True)
     check_count(workers, "workers")
-    config = effective_config(config or own_settings(saved), dataset)
+    config = own_settings(saved) if config is None else as_config(config)
+    config = effective_config(config, dataset)
     imu = imu_buffer(dataset, config)
     localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, near=near, **parts)
     if parts.get("features") is not None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from loam_gtsam.config import Config, MapConfig, config_from_dict, config_to_dict
 from loam_gtsam.cubemap import Contents, grid_of
 from loam_gtsam.datasets.decode.geodesy import GeoReference
-from loam_gtsam.errors import DAMAGED
+from loam_gtsam.errors import DAMAGED, as_path
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.places import Place
@@ -70,7 +70,7 @@ class MapFrame:
 
 def map_of_run(path: str | Path) -> Path:
     """The file of the map in the folder of a run, or a file as it is."""
-    path = Path(path)
+    path = as_path(path)
     return path / MAP_FILE if path.is_dir() else path
 
 
@@ -146,7 +146,8 @@ def write_map(
     OutputError
         As :func:`save_map`.
     """
-    if Path(path).suffix.lower() in _CLOUDS:
+    path = as_path(path)
+    if path.suffix.lower() in _CLOUDS:
         cloud = "loam_gtsam.maps.write_cloud writes clouds"
         raise OutputError(f"{path}: expected a name that ends in {SUFFIX}; {cloud}")
     up, earth = frame.up, frame.earth

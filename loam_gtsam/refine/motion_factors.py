@@ -1,4 +1,4 @@
-"""What a run knew of the motion between its sweeps, as factors of the adjustment."""
+"""What a run knew of the motion between its sweeps and within them, for the adjustment."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import noise_model
+from loam_gtsam.refine.sweeps import SweepPoints
 from loam_gtsam.registration.uncertainty import relative_covariance
-from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, SweepMotion
+from loam_gtsam.types import BoolArray, FloatArray, FrameStatus, IntArray, MapUpdate, SweepMotion
 
 _UNKNOWN: FloatArray = np.diag(np.repeat([0.1, 1.0], 3) ** 2)
 """Covariance of a motion to or from a sweep that was not solved."""
@@ -113,6 +114,38 @@ def step_variances(updates: Sequence[MapUpdate]) -> FloatArray:
     if [update.sweep_motion for update in updates[:2]] == [SweepMotion.GYRO] * 2:
         found[0, :3] = found[:2, :3].min(axis=0)
     return found
+
+
+def to_middles(updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints]) -> list[gtsam.Pose3]:
+    """Poses of the middles of the sweeps, seen from their reference times, as the run had them."""
+    steps = []
+    for update, sweep in zip(updates, sweeps, strict=True):
+        step = gtsam.Pose3.Expmap(update.twist * -sweep.reference)
+        if update.map_T_middle is not None and update.middle_stamp == sweep.stamp:
+            step = update.map_T_lidar.between(update.map_T_middle)
+        steps.append(step)
+    if len(updates) > 1 and updates[0].status is FrameStatus.FIRST and updates[1].status.solved:
+        steps[0] = _first_to_middle(updates, sweeps, steps)
+    return steps
+
+
+def _first_to_middle(
+    updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints], steps: Sequence[gtsam.Pose3]
+) -> gtsam.Pose3:
+    """The step of the first sweep, whose motion the run did not know yet when it told the pose.
+
+    It lies on the parabola through the pose at the reference time and the middle of the second
+    sweep, with the velocity of that one; a rotation that a gyro told stays.
+    """
+    first, second = updates[:2]
+    seconds = (sweeps[1].stamp - first.stamp) * 1e-9
+    moved = gtsam.Pose3.Logmap(first.map_T_lidar.between(second.map_T_lidar.compose(steps[1])))
+    part = -sweeps[0].reference / seconds
+    more = second.twist * seconds - moved  # than with a constant velocity
+    step = gtsam.Pose3.Expmap(part * (moved - more) + part**2 * more)
+    if first.sweep_motion is SweepMotion.GYRO is second.sweep_motion:
+        step = gtsam.Pose3(steps[0].rotation(), step.translation())
+    return step
 
 
 def _stretches(mask: BoolArray) -> IntArray:

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, SolverConfig
-from loam_gtsam.datasets.base import Dataset, sweeps_of_run
+from loam_gtsam.config import Config, SolverConfig, as_config
+from loam_gtsam.datasets.base import Dataset, check_dataset, sweeps_of_run
 from loam_gtsam.datasets.decode.geodesy import GeoReference
+from loam_gtsam.errors import check_all
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import pose_number
@@ -21,6 +22,7 @@ from loam_gtsam.refine.motion_factors import (
     loop_factors,
     odometry_factors,
     step_variances,
+    to_middles,
     told_directions,
 )
 from loam_gtsam.refine.rounds import Round, Settings
@@ -42,7 +44,6 @@ from loam_gtsam.types import (
     IntArray,
     MapUpdate,
     SweepError,
-    SweepMotion,
     Trajectory,
     check_kind,
     stack_poses,
@@ -97,7 +98,10 @@ def run_points(
     frames: list[int] = []
     used: list[SweepPoints] = []
     held: list[SweepPoints] = []
+    check_dataset(dataset)
+    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
     check_placed(updates)
+    config = as_config(config)
     sweeps = sweeps_of_run(dataset, len(updates))
     for number, (sweep, update) in enumerate(zip(sweeps, updates, strict=True)):
         if on_sweep is not None:
@@ -257,6 +261,7 @@ def refine_run(
     run = _Run.of(points, updates, trajectory, "trajectory")
     further, own = gtsam.NonlinearFactorGraph(), list[FactorTies]()
     if graph is not None:
+        check_kind(graph, SavedGraph, "graph", "read_graph(path) and PoseGraph.saved() make one")
         frames = {key: run.frame[s] for key, s in graph.stamps.items() if s in run.frame}
         further.push_back(loop_factors(graph, frames, run.to_middle))
         own = own_ties(graph, frames, run.to_middle)
@@ -338,6 +343,8 @@ class _Run:
     def of(
         points: RunPoints, updates: Sequence[MapUpdate], trajectory: Trajectory | None, name: str
     ) -> _Run:
+        check_kind(points, RunPoints, "points", "run_points(dataset, updates, config) makes them")
+        check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
         if (needed := 1 + max(points.frames, default=-1)) > len(updates):
             got = f"expected all of the run, {needed} or more, got {len(updates)}"
             raise InputError(f"updates: {got}")
@@ -345,10 +352,11 @@ class _Run:
         stamps = np.array([update.stamp for update in frames], np.int64)
         poses = stack_poses(update.map_T_lidar for update in frames)
         if trajectory is not None:
+            check_kind(trajectory, Trajectory, name, "corrected poses are one")
             if not np.array_equal(trajectory.stamps, stamps):
                 raise InputError(f"{name}: expected the stamps of the run's poses, got others")
             poses = trajectory.map_T_lidar
-        steps = _to_middles(frames, points.used)
+        steps = to_middles(frames, points.used)
         first = [pose @ step.matrix() for pose, step in zip(poses, steps, strict=True)]
         odometry = [
             u.map_T_lidar.compose(step).matrix() for u, step in zip(frames, steps, strict=True)
@@ -367,38 +375,6 @@ class _Run:
             (u.map_T_middle or u.map_T_lidar).between(u.map_T_lidar.compose(step))
             for u, step in zip(self.updates, self.to_middle, strict=True)
         ]
-
-
-def _to_middles(updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints]) -> list[gtsam.Pose3]:
-    """Poses of the middles of the sweeps, seen from their reference times, as the run had them."""
-    steps = []
-    for update, sweep in zip(updates, sweeps, strict=True):
-        step = gtsam.Pose3.Expmap(update.twist * -sweep.reference)
-        if update.map_T_middle is not None and update.middle_stamp == sweep.stamp:
-            step = update.map_T_lidar.between(update.map_T_middle)
-        steps.append(step)
-    if len(updates) > 1 and updates[0].status is FrameStatus.FIRST and updates[1].status.solved:
-        steps[0] = _first_to_middle(updates, sweeps, steps)
-    return steps
-
-
-def _first_to_middle(
-    updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints], steps: Sequence[gtsam.Pose3]
-) -> gtsam.Pose3:
-    """The step of the first sweep, whose motion the run did not know yet when it told the pose.
-
-    It lies on the parabola through the pose at the reference time and the middle of the second
-    sweep, with the velocity of that one; a rotation that a gyro told stays.
-    """
-    first, second = updates[:2]
-    seconds = (sweeps[1].stamp - first.stamp) * 1e-9
-    moved = gtsam.Pose3.Logmap(first.map_T_lidar.between(second.map_T_lidar.compose(steps[1])))
-    part = -sweeps[0].reference / seconds
-    more = second.twist * seconds - moved  # than with a constant velocity
-    step = gtsam.Pose3.Expmap(part * (moved - more) + part**2 * more)
-    if first.sweep_motion is SweepMotion.GYRO is second.sweep_motion:
-        step = gtsam.Pose3(steps[0].rotation(), step.translation())
-    return step
 
 
 def _to_references(

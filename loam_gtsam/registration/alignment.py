@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.errors import is_number
 from loam_gtsam.geometry import as_points, checked_pose, voxel_filter
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
@@ -79,8 +80,8 @@ def align(
         left out, and so is a fourth column
     guess : ``target_T_source`` to start from; the identity if None
     config : ``map``, ``matching``, ``solver`` and ``covariance`` are used
-    max_distance : metres to the farthest neighbour at first; the solve then starts again with
-        ``matching.max_distance``. The guess must be nearer than that.
+    max_distance : metres to the farthest neighbour at first, at least ``matching.max_distance``,
+        with which the solve then starts again. The guess must be nearer than that.
 
     Raises
     ------
@@ -94,7 +95,7 @@ def align(
     >>> found.target_T_source, np.sqrt(np.diag(found.covariance))  # doctest: +SKIP
     """
     config = as_config(config)
-    if not max_distance > 0.0:
+    if not (is_number(max_distance) and 0.0 < max_distance < np.inf):
         raise InputError(f"max_distance: expected metres above 0, got {max_distance!r}")
     source, target = _finite_points(source, "source"), _finite_points(target, "target")
     least = config.solver.min_matches

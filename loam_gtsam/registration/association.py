@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.errors import check_array, check_kind
 from loam_gtsam.geometry import cross, dot, fit_lines, norm, transform
 from loam_gtsam.registration.matches import (
     ChosenRows,
@@ -54,7 +55,20 @@ def associate(
     distinct : (E,) mask of :class:`EdgeMatches`; None if all edges are distinct. Distinct edges are
         matched before other edges. If the planes leave a translation open, a distinct edge without
         a line near by is searched for more widely (``wide_search``).
+
+    Raises
+    ------
+    InputError
+        If an argument is of another type or shape.
     """
+    for name, features in {"edges": edges, "planes": planes}.items():
+        check_array(features, name, ("N", 3))
+    check_kind(map_T_lidar, gtsam.Pose3, "map_T_lidar", "gtsam.Pose3(matrix) makes one")
+    for name, cubes in {"edge_map": edge_map, "plane_map": plane_map}.items():
+        check_kind(cubes, CubeMap, name, "mapper.maps.edges and mapper.maps.planes are such")
+    check_kind(config, MatchingConfig, "config", "it is config.matching")
+    if distinct is not None:
+        check_array(distinct, "distinct", (len(edges),), "flags")
     rows = chosen_rows(len(edges), len(planes), config, distinct)
     chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
     return match_features(*chosen, map_T_lidar, edge_map, plane_map, config, rows)

@@ -85,7 +85,7 @@ def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsa
 
 
 class Turns(Protocol):
-    """A source of rotations: an :class:`~loam_gtsam.imu.ImuBuffer` or the IMU of the mapper."""
+    """A source of rotations: an :class:`~loam_gtsam.ImuBuffer` or the IMU of the mapper."""
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """The rotation ``first_R_second`` between two stamps, None if unknown."""

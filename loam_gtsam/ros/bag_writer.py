@@ -15,6 +15,7 @@ from typing import Any, Literal
 from rosbags import rosbag1, rosbag2
 
 from loam_gtsam.config import BagConfig
+from loam_gtsam.errors import as_path
 from loam_gtsam.io.atomic import ClosingWriter
 from loam_gtsam.ros.messages import TYPES, FrameMessages, Points
 from loam_gtsam.types import MapUpdate, OutputError
@@ -47,7 +48,7 @@ class BagWriter(ClosingWriter):
     def __init__(
         self, path: str | Path, config: BagConfig | None = None, *, overwrite: bool = False
     ) -> None:
-        self.path = Path(path)
+        self.path = as_path(path)
         self.frames = 0  # written so far
         self._kind = self.path.suffix
         if self._kind not in (".bag", ".mcap", "") or not self.path.name:

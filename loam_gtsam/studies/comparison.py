@@ -20,7 +20,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import aids_of
-from loam_gtsam.errors import check_count, check_kind
+from loam_gtsam.errors import check_all, check_count
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
@@ -151,7 +151,7 @@ def compare_solvers(
         KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far, as
         it has after an error later than the first sweep
     """
-    check_count(max_frames, "max_frames")
+    check_count(max_frames, "max_frames", optional=True)
     _check_names(contenders)
     # Group by group, as the report shows them; the order within a group is the caller's.
     groups = list(dict.fromkeys(entry.group for entry in contenders))
@@ -192,9 +192,8 @@ def compare_solvers(
 
 
 def _check_names(contenders: Sequence[Contender]) -> None:
-    for entry in contenders:
-        how = "make_contender(Group.SOLVER, name, config) makes one"
-        check_kind(entry, Contender, "contenders", how)
+    how = "make_contender(Group.SOLVER, name, config) makes one"
+    check_all(contenders, Contender, "contenders", how)
     names = [entry.name for entry in contenders]
     if not names or len(set(names)) < len(names):
         raise InputError(

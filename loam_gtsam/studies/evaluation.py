@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
-from loam_gtsam.geometry import five_sigma, inverse_pose, transform
+from loam_gtsam.errors import check_all, check_count
+from loam_gtsam.geometry import as_array, five_sigma, inverse_pose, transform
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.trajectory import check_increasing
 from loam_gtsam.types import (
@@ -110,6 +111,8 @@ def matched_truth(trajectory: Trajectory, reference: Trajectory) -> Trajectory:
     Poses outside the time span of the reference have none. Raises InputError if the stamps of the
     reference do not increase.
     """
+    for one in (trajectory, reference):
+        check_kind(one, Trajectory, "matched_truth", "a run and a data set have one")
     check_increasing(reference, "matched_truth")
     stamps = trajectory.stamps
     inside = (stamps >= reference.stamps[0]) & (stamps <= reference.stamps[-1])
@@ -135,21 +138,31 @@ def absolute_error(
         first common pose is that of the reference, which hides no drift. False: compare the poses
         as they are.
     """
+    from_start, fitted = _alignment(aligned)
     stamps, poses, truth = _common("absolute_error", estimate, reference)
-    if aligned == "start":
+    if from_start:
         _need_orientation("absolute_error", truth)
         poses = truth[0] @ inverse_pose(poses[:1]) @ poses
     poses = poses.copy()
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
-    if aligned is True and np.isfinite(truth).all():
+    if fitted and np.isfinite(truth).all():
         rotations[:] = align_rotations(rotations, truth[:, :3, :3]) @ rotations
-    if aligned is True:
+    if fitted:
         positions[:] = transform(align_positions(positions, truth[:, :3, 3]), positions)
     errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
     angles = _angles_deg(np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations)
     median, maximum = float(np.median(errors)), float(errors.max())
     compared = Trajectory(stamps, poses)
     return AbsoluteError(_rms(errors), median, maximum, _rms(angles), errors, stamps, compared)
+
+
+def _alignment(aligned: object) -> tuple[bool, bool]:
+    """Whether the first poses are made one, and whether all are fitted."""
+    if isinstance(aligned, (bool, np.bool_)):
+        return False, bool(aligned)
+    if isinstance(aligned, str) and aligned == "start":
+        return True, False
+    raise InputError(f"aligned: expected True, False or 'start', got {aligned!r}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,7 +220,7 @@ def relative_error(
     _need_orientation("relative_error", truth)
     travelled = distance_travelled(truth[:, :3, 3])
     path = float(travelled[-1])
-    lengths = path_lengths(path) if lengths is None else np.asarray(lengths, np.float64)
+    lengths = path_lengths(path) if lengths is None else as_array(lengths, "lengths", ("L",))
     translations, rotations = [], []
     for length in lengths:
         ends = np.searchsorted(travelled, travelled + length, side="right")
@@ -289,7 +302,8 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
         If no update lies inside the reference, its stamps do not increase, or it has positions
         alone.
     """
-    check_kind(updates, Sequence, "nees: updates", "result.updates of a run are such")
+    check_all(updates, MapUpdate, "nees: updates", "result.updates of a run are such")
+    check_count(window, "nees: window")
     check_kind(reference, Trajectory, "nees: reference", "the truth of a data set is one")
     check_increasing(reference, "nees")
     first, last = reference.stamps[0], reference.stamps[-1]

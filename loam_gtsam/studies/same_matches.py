@@ -137,7 +137,7 @@ def compare_on_same_matches(
     InputError
         If a contender is no solver, two have the same name, or there is no such driver.
     """
-    check_count(max_frames, "max_frames")
+    check_count(max_frames, "max_frames", optional=True)
     first = contenders[0].config if contenders else None
     names = [contender.name for contender in contenders]
     if first is None or any(c.config is None or "features" in c.parts for c in contenders):

@@ -218,7 +218,7 @@ def _deskewed(
         edge_times=np.zeros(0),
         plane_times=organised.times - since_scan,
         edge_rings=_NO_ROWS,
-        plane_rings=_NO_ROWS,
+        plane_rings=np.zeros(len(organised.times), np.int64),
         sharp=_NO_ROWS,
         flat=_NO_ROWS,
         span=(first - since_scan, last - since_scan),

@@ -156,7 +156,7 @@ def test_array_times_that_are_fractions_of_the_sweep_are_refused() -> None:
         (([np.zeros((3, 3))], [0]), {"times": [np.zeros(2)]}, r"scans\[0\]: Scan.times"),
         (([np.zeros((3, 3))], [0]), {"rings": [np.zeros(3)]}, r"scans\[0\]: Scan.rings"),
         (([Scan(np.zeros((3, 3)), 0)], [0]), {}, "carry their own"),
-        (([Scan(np.zeros((3, 3)), 0), np.zeros((3, 3))],), {}, "only Scan objects"),
+        (([Scan(np.zeros((3, 3)), 0), np.zeros((3, 3))],), {}, "either Scan objects alone"),
         (([], []), {"imu": np.zeros((9, 7))}, r"imu: .* got ndarray; ImuSamples\(stamps, ori"),
         (([], []), {"truth": np.zeros((9, 8))}, r"truth: .* got ndarray; Trajectory\(stamps, map"),
         (([], []), {"gnss": np.zeros((9, 4))}, r"gnss: .* got ndarray; GnssFixes\(stamps, geo"),

@@ -99,7 +99,7 @@ def test_npz_holds_every_frame_without_pickle(result, tmp_path):
     assert arrays["sweep_motions"].tolist() == ["gyro"] * FRAMES
     assert arrays["tilt_priors"].tolist() == ["none"] + ["equivalent"] * (FRAMES - 1)
     assert arrays["follows"].tolist()[-2:] == [u.stamp for u in updates[-3:-1]]
-    assert arrays["follows"][0] == -1
+    assert arrays["follows"][0] == run_files.NO_STAMP
     np.testing.assert_array_equal(arrays["map_T_lidar"][-1], last.map_T_lidar.matrix())
     known = last.uncertainty
     same = ("information", "localizability", "axis_localizability", "directions", "n_edges",

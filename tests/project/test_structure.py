@@ -21,7 +21,7 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 # -- sizes -----------------------------------------------------------------------------------------
 
 LINES_OF_A_FILE, LINES_OF_A_CLASS, LINES_OF_A_FUNCTION = 480, 250, 60
-FILES_OF_THE_ROOT, FILES_OF_A_FOLDER = 10, 12
+FILES_OF_THE_ROOT, FILES_OF_A_FOLDER = 11, 12
 
 
 def code_lines(function: Function, lines: list[str]) -> int:

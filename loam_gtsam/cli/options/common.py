@@ -149,7 +149,8 @@ class SourceOptions(Options):
         "Topic of the reference poses in a bag (PoseStamped, Odometry, NavSatFix, ...)."
     )
     truth_extrinsic: str | None = option(
-        "Pose of the lidar in the frame of the reference poses: x y z, or x y z qx qy qz qw.",
+        "Pose of the lidar in the frame of the reference poses: x y z, x y z qx qy qz qw, or the "
+        "12 numbers of a 3 x 4 matrix.",
         metavar="NUMBERS",
     )
     sensor: str | None = option(

@@ -14,6 +14,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import rows_in_time
 from loam_gtsam.geometry import as_array, as_stamps
+from loam_gtsam.trajectory import check_poses
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError, IntArray, check_array
 
 FIX = "sensor_msgs/msg/NavSatFix"
@@ -121,6 +122,7 @@ class WheelSamples:
         object.__setattr__(self, "start_T_body", poses)
         if (np.diff(stamps) <= 0).any():
             raise InputError("WheelSamples.stamps: expected ascending ones")
+        check_poses(poses, "WheelSamples.start_T_body")
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -20,7 +20,7 @@ from loam_gtsam.datasets.sim.patterns import PATTERNS, fired, unit_vectors
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene, build_avenue
-from loam_gtsam.errors import nearest
+from loam_gtsam.errors import is_number, nearest
 from loam_gtsam.geometry import as_stamps, inverse_pose
 from loam_gtsam.types import (
     ConfigError,
@@ -126,26 +126,26 @@ class SimulatedWorld(Loader):
         acceleration_noise: float | None = None,
         acceleration_bias: Axes | None = None,
     ) -> None:
-        if isinstance(scene, str):
+        if not isinstance(scene, Scene):
             _one_of("scene", scene, SCENES)
         _one_of("sensor", sensor, SENSORS | PATTERNS)
         _one_of("start", start, STARTS)
         _one_of("imu", imu, IMUS)
         _whole_at_least(0, seed=seed)
-        _whole_at_least(1, frames=frames)
-        _whole_at_least(8, columns=columns)
+        _whole_at_least(1, **_given(frames=frames))
+        _whole_at_least(8, **_given(columns=columns))
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         self._lidar, self._rings = sensor, sensor in SENSORS
         _, own_columns = SENSORS[sensor] if self._rings else PATTERNS[sensor]
         self._columns = own_columns if columns is None else columns
-        speed = self.scene.speed if speed is None else float(speed)
+        speed = self.scene.speed if speed is None else speed
         noises = {"gyro_noise": gyro_noise, "acceleration_noise": acceleration_noise}
         _at_least(0.0, range_noise=range_noise, foliage_noise=foliage_noise)
-        _at_least(0.0, imu_noise=imu_noise, **noises)
+        _at_least(0.0, **_given(imu_noise=imu_noise, **noises))
         _at_least(0.1, rate=rate)
         _at_least(0.01, speed=speed)
         _at_least(_MIN_RANGE, max_range=max_range)
-        if not 0.0 <= dropout < 1.0:
+        if not (is_number(dropout) and 0.0 <= dropout < 1.0):
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
@@ -153,7 +153,7 @@ class SimulatedWorld(Loader):
         biases = {"gyro_bias": gyro_bias, "acceleration_bias": acceleration_bias}
         own = {"attitude_noise": imu_noise} | noises | biases
         self._imu_errors = ImuErrors.of(imu, seed, own)
-        self._motion = Motion(self.scene, speed, start == "moving")
+        self._motion = Motion(self.scene, float(speed), start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
         spins = _SPIN | {"model": sensor} if self._rings else {"rings": "none"}
@@ -287,19 +287,24 @@ def _seconds(stamps: IntArray) -> FloatArray:
 
 
 def _one_of(name: str, value: str, names: Collection[str]) -> None:
-    if value not in names:
+    if not isinstance(value, str) or value not in names:
         near = nearest(value, names, listing=False)
         raise ConfigError(f"{name}: expected one of {', '.join(names)}; got {value!r}{near}")
 
 
-def _whole_at_least(least: int, **values: int | None) -> None:
+def _given(**values: Any) -> dict[str, Any]:
+    """What is not None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _whole_at_least(least: int, **values: int) -> None:
     for name, value in values.items():
-        if value is not None and not isinstance(value, (int, np.integer)):
+        if not isinstance(value, (int, np.integer)):
             raise ConfigError(f"{name}: expected a whole number, got {value!r}")
     _at_least(least, **values)
 
 
-def _at_least(least: float, **values: float | None) -> None:
+def _at_least(least: float, **values: float) -> None:
     for name, value in values.items():
-        if value is not None and not (math.isfinite(value) and value >= least):
+        if not (is_number(value) and least <= value < math.inf):
             raise ConfigError(f"{name}: expected at least {least:g}, got {value!r}")

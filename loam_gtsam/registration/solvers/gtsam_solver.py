@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import SolverConfig
+from loam_gtsam.errors import InputError, check_kind, is_number
 from loam_gtsam.factors import (
     MatchRows,
     checked_factor,
@@ -40,6 +41,7 @@ from loam_gtsam.registration.solvers.base import (
 )
 from loam_gtsam.types import BoolArray, FloatArray
 
+_KERNELS = ("huber", "geman_mcclure")
 _REDESCENDING = 2.816
 """Width of a Geman-McClure kernel over the width of a Huber kernel with the same efficiency on
 normal noise: 3.787 and 1.345 at 95 %."""
@@ -314,7 +316,6 @@ def _kept(units: FloatArray, width: float, kernel: str) -> FloatArray:
     return scales
 
 
-@lru_cache(maxsize=1)  # asked for by the solver, then for the motion within the sweep
 def match_rows(
     matches: ScanMatches, kernel_width: float = np.inf, kernel: str = "huber"
 ) -> MatchRows:
@@ -334,7 +335,22 @@ def match_rows(
     would scale all rows down. The Cauchy kernel loses the pose in foliage, where many matches
     agree on a wrong pose. The kernel of Geman and McClure (1985), ``1 / (1 + (u / c s)^2)``, does
     not, and rejects passing objects better than the Huber kernel.
+
+    Raises
+    ------
+    InputError
+        If the matches are none, the width no number, or the kernel unknown.
     """
+    check_kind(matches, ScanMatches, "matches", "associate makes them")
+    if not (is_number(kernel_width) and kernel_width > 0.0):
+        raise InputError(f"kernel_width: expected a number above 0, got {kernel_width!r}")
+    if not isinstance(kernel, str) or kernel not in _KERNELS:
+        raise InputError(f"kernel: expected {' or '.join(_KERNELS)}, got {kernel!r}")
+    return _rows(matches, kernel_width, kernel)
+
+
+@lru_cache(maxsize=1)  # asked for by the solver, then for the motion within the sweep
+def _rows(matches: ScanMatches, kernel_width: float, kernel: str) -> MatchRows:
     e, p = matches.edges, matches.planes
     edge_units, plane_units = e.distances / e.sigmas, np.abs(p.distances) / p.sigmas
     edge_weights, plane_weights = e.weights, p.weights

@@ -62,9 +62,8 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
                 "choose another one"
             )
     if later.stamp <= earlier.stamp:
-        raise InputError(
-            f"later: expected a stamp after {earlier.stamp}, got {later.stamp}; swap the two"
-        )
+        how = "swap the two" if later.stamp < earlier.stamp else "give two frames"
+        raise InputError(f"later: expected a stamp after {earlier.stamp}, got {later.stamp}; {how}")
     if begins:
         return later.covariance.copy()
     first, second = earlier.uncertainty, later.uncertainty

@@ -40,8 +40,9 @@ class Refusal:
 class StampCheck:
     """Comparison of each stamp with the stamp of the last sweep that was used.
 
-    A stamp must be later than the last one, by a quarter of the usual interval at least and by at
-    most :data:`LARGEST_STEP`; one wrong stamp costs one sweep. :data:`IN_A_ROW` of those that are
+    A stamp must be later than the last one, by a quarter of the usual interval at least (unless
+    that sweep was so short, as where a cover left its end alone) and by at most
+    :data:`LARGEST_STEP`; one wrong stamp costs one sweep. :data:`IN_A_ROW` of those that are
     far off and consistent show that the clock was set. If ahead, the run continues as if no time
     had passed; if back, it cannot, since trajectories ascend.
     """
@@ -49,6 +50,7 @@ class StampCheck:
     def __init__(self) -> None:
         self._steps: deque[int] = deque(maxlen=_USUAL)  # between the last sweeps that were used
         self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and count
+        self._took = 0.0  # seconds that the last sweep took, 0 if that is not known
 
     def refuse(self, stamp: int, last: int, seconds: float = 0.0) -> Refusal | None:
         """The reason why a sweep cannot be used, by its stamp and that of the last one used, ns.
@@ -62,14 +64,14 @@ class StampCheck:
         later = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
         if 0 < step < _SHORTEST:
             return Refusal(SweepFault.TOO_SOON, f"{later}; expected nanoseconds")
-        if 0 < step < _SOON * usual:
+        if 0 < step < _SOON * usual and not 0.0 < self._took <= step * 1e-9:
             told = f"{usual * 1e-9:.3g} s are usual"
             if not self._steps:
                 told = f"the times of its points span {seconds:.3g} s: are they seconds?"
             return Refusal(SweepFault.TOO_SOON, f"{later}; {told}")
         if 0 < step <= largest:
             self._steps.append(step)
-            self._doubted = None
+            self._doubted, self._took = None, seconds
             return None
         earlier = f"stamp {stamp} ns is not later than the last one, {last} ns"
         if step == 0:

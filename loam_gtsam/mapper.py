@@ -290,10 +290,11 @@ class Mapper:
         scan = self.errors.of_scan(solution, posed.sweep, between, small=self.maps.small)
         told = self.imu, posed, frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused, unlike, said, more = with_imu(*told)
+            posed, solution, pose, tilt, fused, unlike, said, more, other = with_imu(*told)
         if found.message or found.in_vain or unlike:
             step = frame.predicted, posed, solution.map_T_lidar
             self.errors.jumped(*step, unlike=unlike, searched=found.searched)
+        self.errors.disputed(solution.map_T_lidar, other)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.saying(self.point_times.problem or said))

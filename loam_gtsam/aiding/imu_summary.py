@@ -25,6 +25,7 @@ class ImuSummary:
     sweep_motions, tilt_priors : how many frames had which
     gyro_trusted : whether the gyro still agreed with the scans in the end
     gyro_left_out : number of frames in which it did not
+    disputed : number of frames in which the scans told another motion than an IMU that had agreed
     problems : sentences on the samples, and on what the scans say about clock, unit and mounting
     """
 
@@ -36,6 +37,7 @@ class ImuSummary:
     tilt_priors: Mapping[str, int]
     gyro_trusted: bool
     gyro_left_out: int
+    disputed: int
     problems: tuple[str, ...]
 
 
@@ -43,7 +45,7 @@ def imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
     """Summary of a run, from its IMU and the results of its sweeps."""
     tilt_priors = Counter(str(update.tilt_prior) for update in updates)
     report, left_out = aid.buffer.report, aid.gyro.left_out
-    in_the_run = _in_the_run(report, tilt_priors, left_out)
+    in_the_run = _in_the_run(report, tilt_priors, left_out, aid.dispute.frames)
     return ImuSummary(
         report=report,
         level=aid.level,
@@ -53,12 +55,15 @@ def imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
         tilt_priors=tilt_priors,
         gyro_trusted=aid.gyro.holds,
         gyro_left_out=left_out,
+        disputed=aid.dispute.frames,
         problems=(*report.problems, *in_the_run, *aid.problems),
     )
 
 
-def _in_the_run(report: ImuReport, tilt_priors: Mapping[str, int], left_out: int) -> list[str]:
-    """Sentences on sweeps without an orientation, and on those without the gyro."""
+def _in_the_run(
+    report: ImuReport, tilt_priors: Mapping[str, int], left_out: int, disputed: int
+) -> list[str]:
+    """Sentences on sweeps without an orientation, without the gyro, and in dispute."""
     problems = []
     dropped = tilt_priors.get("dropped", 0)
     if dropped and report.orientation != "none":
@@ -70,5 +75,11 @@ def _in_the_run(report: ImuReport, tilt_priors: Mapping[str, int], left_out: int
             f"IMU: its gyro turned unlike the scans and was given up for {left_out} "
             "sweeps; check imu.lidar_R_imu_deg, units and stamps; if the gyro is right, the poses "
             "are wrong"
+        )
+    if disputed:
+        problems.append(
+            f"IMU: in {disputed} sweeps gyro and accelerometer told another motion than the scans; "
+            "either most of what the lidar sees moved, as in a lift, on a ship or among lorries, "
+            "or the accelerometer failed; covariances allow for both"
         )
     return problems

@@ -17,7 +17,7 @@ from loam_gtsam.imu.preintegration import (
     Prediction,
     StartSigmas,
 )
-from loam_gtsam.imu.preintegration_window import GRAVITY, VELOCITY
+from loam_gtsam.imu.preintegration_window import GRAVITY, VELOCITY, InertialState
 from loam_gtsam.types import FloatArray, SweepError
 
 _FORCE = 0.2, 3.0
@@ -40,6 +40,9 @@ _GIVEN_UP = 5.0  # frames of disagreement less those of agreement from which a g
 _TURNED = five_sigma(3)
 """As ``_UNLIKELY``, of a rotation."""
 _CLEAR = 3.0  # frames of disagreement for which a rotation far beyond that counts
+_LONGEST = 20_000_000_000
+"""Nanoseconds after which the accelerometer is the one that is wrong: lifts arrive, and ships and
+lorries reach their speed."""
 _LONGER = 6  # times that a gyro which is given up again is given up for twice as long
 
 
@@ -104,6 +107,51 @@ class GyroTrust:
             self._given_up = min(self._given_up + 1, _LONGER)
 
 
+class Dispute:
+    """Where gyro and accelerometer lead by themselves, from when scans began to contradict them.
+
+    If they had agreed for some time, one is as likely to be wrong as the other: an accelerometer
+    fails as seldom as most of what a lidar sees moves along with it, as in a lift, or away from it,
+    as a ship does from a quay. A turn that the scans deny is no dispute: see :class:`GyroTrust`.
+
+    Attributes
+    ----------
+    holds : whether scans contradicted them so often that they are not used
+    frames : number of frames in which it held
+    """
+
+    def __init__(self) -> None:
+        self.holds, self.frames = False, 0
+        self._agreed = self._began = 0  # frames before it, and the stamp of its first one
+        self.alone: InertialState | None = None
+
+    @property
+    def problem(self) -> str:
+        """Sentence for the user while it holds."""
+        text = "gyro and accelerometer tell another motion than the scans: one of the two is wrong"
+        return text if self.holds else ""
+
+    def settle(self) -> None:
+        """It is over, or was none; they must agree anew before another one may begin."""
+        self.holds, self._agreed, self.alone = False, 0, None
+
+    def compared(self, predicted: InertialState, contradictions: int, *, agree: bool) -> None:
+        """Take in a frame of which the scan agrees, or not, with the predicted state."""
+        if self.alone is None:
+            self._agreed += agree
+            if not agree and self._agreed >= _OUTWEIGHS:
+                self.alone, self._began = predicted, predicted.stamp
+        elif not (contradictions or self.holds):
+            self.alone = None  # by chance
+        self.holds = self.holds or (self.alone is not None and contradictions >= _DISTRUST)
+        self.frames += self.holds
+
+    def ends(self, distance: float) -> bool:
+        """Whether it is over, by the squared Mahalanobis distance of the scan from ``alone``."""
+        assert self.alone is not None
+        return distance < _UNLIKELY or self.alone.stamp - self._began > _LONGEST
+
+
 class TightCoupling:
     """What scans and IMU together know of pose, velocity, biases and gravity.
 
@@ -114,7 +162,8 @@ class TightCoupling:
     ----------
     contradicted : whether the last :meth:`observe` met a pose that is unlike a trusted prediction
     turn_surprise : how the last :meth:`observe` found the predicted rotation, as a squared
-        Mahalanobis distance; 0 without a prediction
+        Mahalanobis distance; 0 without a prediction, and in a dispute, which bends it
+    dispute : whether scans contradict gyro and accelerometer that had agreed
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -124,6 +173,7 @@ class TightCoupling:
         self._rejected = False  # whether the prediction of this frame was taken back
         self._contradictions = 0
         self.contradicted, self.turn_surprise = False, 0.0
+        self.dispute = Dispute()
 
     @property
     def trusted(self) -> bool:
@@ -177,6 +227,25 @@ class TightCoupling:
         """Take the last prediction back: a sweep fitted better without the IMU."""
         self._predicted, self._rejected = None, True
 
+    def other_pose(
+        self, stamp: int, map_T_lidar: gtsam.Pose3
+    ) -> tuple[gtsam.Pose3, FloatArray] | None:
+        """Pose and covariance (6, 6) to which gyro and accelerometer alone lead in a dispute.
+
+        None if there is none. ``map_T_lidar`` is where the scans have the lidar at ``stamp``.
+        """
+        if not self.dispute.holds or self._odometry is None:
+            return None
+        assert self.dispute.alone is not None
+        if self.dispute.alone.stamp != stamp:
+            return None
+        pose, covariance = self._odometry.pose_of(self.dispute.alone)
+        away = pose.localCoordinates(map_T_lidar)
+        if self.dispute.ends(float(away @ np.linalg.solve(covariance, away))):
+            self.dispute.settle()
+            return None
+        return pose, covariance
+
     def moved(self, map_T_lidar: gtsam.Pose3, buffer: ImuBuffer) -> None:
         """Take the map, as the frame of the last :meth:`observe` sees it, to be elsewhere.
 
@@ -185,6 +254,7 @@ class TightCoupling:
         """
         if self._odometry is None or self._odometry.distance_to(map_T_lidar) < _UNLIKELY:
             return
+        self.dispute.settle()
         try:
             self._odometry.moved(map_T_lidar)
         except SweepError:
@@ -235,8 +305,10 @@ class TightCoupling:
         self.contradicted, self.turn_surprise = False, 0.0
         if stamp <= last[0]:  # sweeps of unlike length
             return None
+        self._carry_on(stamp, buffer)
         try:
             if self._odometry is not None and self._predicted == stamp:
+                predicted = self._odometry.predicted
                 fused = self._odometry.update(pose, information, step)
                 self.turn_surprise = self._odometry.turn_surprise
                 unlikely = self._odometry.surprise >= _UNLIKELY
@@ -244,6 +316,7 @@ class TightCoupling:
                 agree = fused is not None and not unlikely
                 count = self._contradictions + (-1 if agree else _OUTWEIGHS)
                 self._contradictions = min(max(count, 0), 2 * _DISTRUST)
+                self._compare(predicted, agree=agree)
                 return fused if agree and self.trusted else None
             seconds = (stamp - last[0]) * 1e-9
             velocity = (pose.translation() - last[1].translation()) / seconds
@@ -260,6 +333,24 @@ class TightCoupling:
         except SweepError:  # no window can begin here: with the next frame, then
             self._odometry = None
         return None
+
+    def _compare(self, predicted: InertialState | None, *, agree: bool) -> None:
+        """Take in whether scans and prediction agree; a turn that they deny begins no dispute."""
+        if self.dispute.alone is not None:
+            self.turn_surprise = 0.0
+        if predicted is not None and self.turn_surprise < _TURNED:
+            self.dispute.compared(predicted, self._contradictions, agree=agree)
+
+    def _carry_on(self, stamp: int, buffer: ImuBuffer) -> None:
+        """Bring what the IMU tells alone to this moment; where its samples end, so does that."""
+        alone, margin = self.dispute.alone, round(self.config.max_gap * 1e9)
+        if alone is None or self._odometry is None:
+            return
+        samples = buffer.samples_between(alone.stamp - margin, stamp + margin)
+        try:
+            self.dispute.alone = self._odometry.carried(alone, stamp, samples)
+        except SweepError:
+            self.dispute.settle()
 
     def _gone_on(
         self, stamp: int, velocity: FloatArray, spread: FloatArray

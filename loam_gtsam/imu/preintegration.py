@@ -198,6 +198,20 @@ class InertialOdometry:
         self._pending = frame
         return prediction
 
+    @property
+    def predicted(self) -> InertialState | None:
+        """The state of the last :meth:`predict`; None if an update has followed."""
+        return None if self._pending is None else self._pending.predicted
+
+    def carried(self, state: InertialState, stamp: int, samples: ImuSamples) -> InertialState:
+        """A state of a frame, carried on to a stamp by the samples; errors of :meth:`predict`."""
+        return WindowFrame(self.config, 1, state, stamp, samples).predicted
+
+    def pose_of(self, state: InertialState) -> tuple[gtsam.Pose3, FloatArray]:
+        """``map_T_lidar`` of a state, and its covariance (6, 6)."""
+        covariance = self._to_lidar @ state.covariance[POSE, POSE] @ self._to_lidar.T
+        return state.map_T_imu.compose(self._lidar_T_imu.inverse()), covariance
+
     def _of_lidar(self, state: InertialState, rate: FloatArray) -> tuple[gtsam.Pose3, FloatArray]:
         """Pose and velocity of the lidar, round which the IMU goes as the platform turns."""
         lever = cross(rate - state.gyro_bias, self._lidar_T_imu.translation())

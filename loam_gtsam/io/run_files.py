@@ -311,5 +311,6 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
         "gyro_bias_rad_s": imu.gyro_bias.tolist(),
         "gyro_trusted": imu.gyro_trusted,
         "gyro_left_out": imu.gyro_left_out,
+        "disputed": imu.disputed,
         "problems": list(imu.problems),
     }

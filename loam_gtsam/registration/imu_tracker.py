@@ -13,7 +13,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import checked_pose
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.coupling import GyroTrust, TightCoupling
+from loam_gtsam.imu.coupling import Dispute, GyroTrust, TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import NO_STEP, Fused, Prediction
@@ -50,6 +50,8 @@ class Registration(NamedTuple):
     contradicted: bool = False  # whether they predicted another pose
     problem: str = ""  # sentence for the user
     turned: FloatArray | None = None  # (3,) rad/s that the gyro turned more than the last scans
+    # Where gyro and accelerometer alone lead if scans contradict them, and its covariance (6, 6).
+    other: tuple[gtsam.Pose3, FloatArray] | None = None
 
 
 def with_imu(
@@ -158,6 +160,11 @@ class ImuTracker:
     def map_up(self) -> FloatArray | None:
         """(3,) unit vector, map frame; None if it was not found, or the IMU is not trusted."""
         return self._coupling.up(self.level if self.gyro.holds else None)
+
+    @property
+    def dispute(self) -> Dispute:
+        """Whether scans contradict gyro and accelerometer."""
+        return self._coupling.dispute
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -298,7 +305,9 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        told = fused, contradicted, self.gyro.problem, self._turns.more
+        other = self._coupling.other_pose(stamp, solution.map_T_lidar)
+        problem = self.gyro.problem or self.dispute.problem
+        told = fused, contradicted, problem, self._turns.more, other
         return Registration(posed, solution, pose, tilt, *told)
 
     def predict(self, stamp: int) -> Prediction | None:
@@ -308,6 +317,7 @@ class ImuTracker:
         """
         if self.config.coupling != "tight" or self.trusted_gyro is None:
             self._coupling.reject()
+            self.dispute.settle()
             return None
         return self._coupling.predict(stamp, self.buffer)
 

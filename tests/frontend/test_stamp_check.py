@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from io import StringIO
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -80,6 +81,16 @@ def test_before_an_interval_is_known_the_time_of_a_sweep_tells_what_is_too_soon(
     early = StampCheck().refuse(START + TENTH, START, 1.0)
     assert early is not None
     assert early.message.endswith("the times of its points span 1 s: are they seconds?")
+
+
+def test_the_sweep_after_one_whose_end_alone_was_seen_is_not_too_soon():
+    """If the stamp is that of the first point that is left."""
+    for took, answer in ((0.012, ""), (TENTH * 1e-9, "too_soon"), (0.0, "too_soon")):
+        check, stamps = StampCheck(), [*steps(START, 5), START + 5 * TENTH - 12_000_000]
+        for last, stamp in pairwise(stamps):
+            assert check.refuse(stamp, last, took if stamp == stamps[-1] else 0.1) is None
+        refusal = check.refuse(START + 5 * TENTH, stamps[-1], 0.1)
+        assert (refusal.fault if refusal else "") == answer
 
 
 def test_a_sensor_may_become_faster_and_a_gap_is_no_usual_interval():

@@ -265,7 +265,7 @@ def test_what_an_imu_did_is_summed_up(result):
     expected = {
         "samples": len(WORLD.imu.stamps), "rate_hz": pytest.approx(200.0), "orientation": "ahrs",
         "gaps": 0, "problems": [], "gyro_bias_rad_s": result.imu.gyro_bias.tolist(),
-        "gyro_trusted": True, "gyro_left_out": 0, "sweep_motions": {"gyro": FRAMES},
+        "gyro_trusted": True, "gyro_left_out": 0, "disputed": 0, "sweep_motions": {"gyro": FRAMES},
         "tilt_priors": {"none": 1, "equivalent": FRAMES - 1},
     }  # fmt: skip
     assert {name: imu[name] for name in expected} == expected

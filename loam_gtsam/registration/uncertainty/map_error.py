@@ -34,7 +34,7 @@ class MapError:
         self._drift_factor, self._lag = config.covariance.drift, config.imu.lag
         self._velocity = MotionFilter(config.solver)
         self.drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
-        self._rivals, self._moved = _Rivals(), np.zeros((6, 6))
+        self._rivals, self._moved, self._disputed = _Rivals(), np.zeros((6, 6)), np.zeros((6, 6))
         self._first: PosedSweep | None = None
         self._searches = config.deskew.model != "predicted"  # for the first motion
         self._origin = _Origin()
@@ -153,6 +153,23 @@ class MapError:
         """
         in_map = pose.AdjointMap() * step
         self.drift = self.drift + 0.5 * (in_map @ in_map.T + expected)
+
+    def add_dispute(
+        self, pose: gtsam.Pose3, step: FloatArray | None, spread: FloatArray | None
+    ) -> None:
+        """As :meth:`add_jump`, of all frames since an IMU began to lead elsewhere.
+
+        ``step`` (6,) leads there, with the covariance ``spread`` (6, 6); None if it does not. The
+        error grows as the two part, and stays when the dispute is over.
+        """
+        if step is None or spread is None:
+            self._disputed = np.zeros((6, 6))
+            return
+        in_map = pose.AdjointMap() @ step
+        grown = 0.5 * (np.outer(in_map, in_map) + spread) - self._disputed
+        more = nearest_positive(grown)
+        self._disputed = self._disputed + more
+        self.drift = self.drift + more
 
     def add_expected(self, motion: MotionPrior) -> None:
         """A sweep went into the map where it was expected, which nothing else tells."""

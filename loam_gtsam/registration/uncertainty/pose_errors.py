@@ -250,6 +250,14 @@ class PoseErrors:
         elif np.array_equal(posed.twist, expected.posed.twist):
             self._own.stray(step)
 
+    def disputed(self, pose: gtsam.Pose3, other: tuple[gtsam.Pose3, FloatArray] | None) -> None:
+        """Account for another pose, with its covariance (6, 6), to which an IMU alone leads."""
+        step = spread = None
+        if other is not None:
+            to_map = other[0].AdjointMap()
+            step, spread = pose.localCoordinates(other[0]), to_map @ other[1] @ to_map.T
+        self._map.add_dispute(pose, step, spread)
+
     def moved(self, step: gtsam.Pose3) -> None:
         """As :meth:`MapError.add_move`."""
         self._map.add_move(step)

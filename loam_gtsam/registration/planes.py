@@ -8,7 +8,16 @@ import numpy as np
 
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import dot, fit_planes, moments, norm, transform
+from loam_gtsam.geometry import (
+    cross,
+    dot,
+    fit_planes,
+    moments,
+    norm,
+    symmetric_eigenvalues,
+    symmetric_eigenvector,
+    transform,
+)
 from loam_gtsam.registration.matches import PlaneMatches, deviations
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.tags import LEAST_ANGLE, Faces, sines
@@ -20,6 +29,9 @@ _MORE = 2
 _ROUGH, _WRONG = 2.0, 4.0
 """A plane is rough if a neighbour lies farther off than twice the median of the sweep's planes, as
 less than one in ten of flat ones do by noise. It is wrong by four times what is beyond that."""
+_WIDE, _THICK = (8.0, 32.0), 1.0
+"""Metres along a surface (a pavement, a floor) and across it, within which it may be flat."""
+_UNLIKE = 0.5  # sine of the angle between the normals of a point's own plane and of another surface
 _SURE = 2.0  # standard deviations beyond which a difference is none of noise (95 %)
 
 
@@ -72,17 +84,21 @@ def match_surfaces(
     near = plane_map.nearest(points_map, k, reach, around)
     rows = np.flatnonzero(near.squared[:, -1] < reach**2)
     fits = _fit(near.points.take(rows, axis=0), config)
-    sight = map_T_lidar[:3, 3:] - points_map.take(rows, axis=0).T
-    side = dot(fits.normals, sight) / np.maximum(norm(sight), _TINY)
-    # A view tells the side if its angle to the plane is beyond the error of the normal.
-    spread = np.maximum(fits.eigenvalues[1], _TINY)
-    least = _SURE * config.point_sigma / np.sqrt(k * spread)
-    facing = fits.normals * (np.sign(side) * (np.abs(side) > least))
-    seen = sines(near.views.take(rows, axis=0), facing)
-    hidden = (seen < -least).any(axis=0)
+    here = points_map.take(rows, axis=0).T
+    sight = map_T_lidar[:3, 3:] - here
+    sight /= np.maximum(norm(sight), _TINY)
+    side, least = dot(fits.normals, sight), _least_sines(fits, config)
+    views, own = near.views.take(rows, axis=0), _towards(fits.normals, sight, least)
+    facing = own.copy()
+    for wide in _WIDE:
+        normals, surely = _wide_surfaces(here, fits.normals, wide, config)
+        better = surely < least
+        facing[:, better] = _towards(normals, sight, surely)[:, better]
+        least[better] = surely[better]
+    hidden = (sines(views, facing) < -least).any(axis=0)
     # A plane that is seen at a steeper angle now has moved more if ranges are too long.
-    sight = map_T_lidar[:3, 3:] - fits.centres
-    turned = seen.mean(axis=0) - dot(facing, sight) / np.maximum(norm(sight), _TINY)
+    seen, away = sines(views, own), map_T_lidar[:3, 3:] - fits.centres
+    turned = seen.mean(axis=0) - dot(own, away) / np.maximum(norm(away), _TINY)
     known = seen.any(axis=0) & ~hidden & (np.abs(turned) > LEAST_ANGLE)
     by_range = np.where(known, np.sign(side) * turned, 0.0)
     doubtful = np.flatnonzero(hidden & fits.planar)
@@ -138,9 +154,54 @@ def _on_this_side(
     fits = _fit(np.take_along_axis(more.points, order[:, :, None], axis=1), config)
     normals = fits.normals * np.sign(dot(fits.normals, facing))
     depth = dot(first.points.T - fits.centres[:, None], normals[:, None])
-    behind = (depth < -_SURE * config.point_sigma) & (sines(first.views, normals) < -least)
-    explained = behind | (sines(first.views, facing) >= -least)
+    from_behind = sines(first.views, facing) < -least
+    explained = ~from_behind | (depth < -_SURE * config.point_sigma)
     return fits._replace(planar=fits.planar & known & explained.all(axis=0)), known
+
+
+def _towards(normals: FloatArray, sight: FloatArray, least: FloatArray) -> FloatArray:
+    """(3, M) normals turned to where unit vectors (3, M) point; zero where these do not tell."""
+    side = dot(normals, sight)
+    turned: FloatArray = normals * (np.sign(side) * (np.abs(side) > least))
+    return turned
+
+
+def _least_sines(fits: _Fits, config: MatchingConfig) -> FloatArray:
+    """(M,) sines of the angles from which on a view is beyond the error of the normal."""
+    spread = np.maximum(fits.eigenvalues[1], _TINY)
+    least: FloatArray = _SURE * config.point_sigma / np.sqrt(config.neighbours * spread)
+    return least
+
+
+def _wide_surfaces(
+    points: FloatArray, normals: FloatArray, wide: float, config: MatchingConfig
+) -> tuple[FloatArray, FloatArray]:
+    """The surface about each of M points (3, M) of a sweep, by all around it that face alike.
+
+    These are all of this side, and wider apart than the neighbours of one point, so that they tell
+    a flat surface better than ``normals`` (3, M), which are by the neighbours.
+
+    Returns
+    -------
+    normals, least : (3, M), and (M,) as of :func:`_least_sines`; infinite without such a surface
+    """
+    axis = np.abs(normals).argmax(axis=0)
+    size = np.where(axis == np.arange(3)[:, None], _THICK, wide)
+    corner = np.floor(points / size)
+    keys = np.concatenate([corner, axis[None]])
+    counts, cells = np.unique(keys, axis=1, return_inverse=True, return_counts=True)[:0:-1]
+    cells = cells.reshape(-1)
+    away = points - corner * size
+    away -= np.array([np.bincount(cells, along) / counts for along in away])[:, cells]
+    x, y, z = away
+    pairs = ((x, x), (y, y), (z, z), (x, y), (y, z), (x, z))
+    covariance = np.array([np.bincount(cells, a * b) / counts for a, b in pairs])
+    eigenvalues = symmetric_eigenvalues(covariance)
+    sigma = np.maximum(np.sqrt(np.maximum(eigenvalues[0], 0.0)), config.point_sigma)
+    least = (_SURE * sigma / np.sqrt(np.maximum(counts * eigenvalues[1], _TINY)))[cells]
+    whole = symmetric_eigenvector(covariance, eigenvalues[0])[:, cells]
+    least[norm(cross(whole, normals)) > _UNLIKE] = np.inf
+    return whole, least
 
 
 class _Fits(NamedTuple):

@@ -88,6 +88,18 @@ def test_a_view_that_is_too_flat_to_tell_the_side_counts_for_both() -> None:
     assert len(matched(wall((0.0, steep)), points, FRONT).planes) == 0
 
 
+def test_the_sweep_knows_a_wide_flat_surface_better_than_five_points_of_the_map_do() -> None:
+    """A view from behind at 6 degrees, as of the ceiling below a floor: five points know 9."""
+    behind, points = (
+        wall((0.0, np.array([20.0, 2.0, 1.0]))),
+        at(0.0, MIDDLE + np.array([0.0, 0.0, 0.9])),
+    )
+    assert len(matched(behind, points, FRONT).planes) == 0
+    assert len(matched(behind, points[:1], FRONT).planes) == 1  # alone it is no surface
+    rough = points + np.outer(np.resize([0.1, 0.5], len(points)), [0.0, 1.0, 0.0])
+    assert len(matched(behind, rough, FRONT).planes) > 0.9 * len(points)
+
+
 def test_an_edge_at_the_end_of_the_wall_is_matched_from_both_sides() -> None:
     edges, planes = CubeMap(MAP, 0.05), CubeMap(MAP, 0.4)
     edge = np.column_stack([np.full(9, 3.0), np.zeros(9), np.linspace(-1.0, 1.0, 9)])

@@ -23,6 +23,7 @@ from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _RAW = "velodyne_points"
+_RIGID = "12 numbers of a rigid transform"
 _KITTI_360 = re.compile(r"2013_05_28_drive_\d{4}_(sync|extract)")
 _EARTH_RADIUS = 6378137.0  # metres, as in the development kit
 _LATITUDE, _LONGITUDE, _ALTITUDE = 0, 1, 2
@@ -188,16 +189,17 @@ def camera_T_lidar_of(root: Path) -> FloatArray | None:
         raise DatasetError(text) from error
 
 
+def _rigid(line: str) -> FloatArray:
+    return tables.rigid_matrix([float(word) for word in line.split()])
+
+
 def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> Trajectory | None:
     """Poses of the scanner from ``poses/NN.txt``, of the left camera, beside ``sequences/NN``."""
     path = root.resolve().parent.parent / "poses" / f"{root.resolve().name}.txt"
     if not path.is_file():
         return None
 
-    def pose(line: str) -> FloatArray:
-        return tables.rigid_matrix([float(word) for word in line.split()])
-
-    poses = tables.convert_lines(path, pose, "12 numbers of a rigid transform")
+    poses = tables.convert_lines(path, _rigid, _RIGID)
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
     moved = inverse_pose(camera_T_lidar) @ np.reshape(poses, (-1, 4, 4)) @ camera_T_lidar
@@ -230,13 +232,9 @@ def kitti_360_truth(root: Path, problems: list[str]) -> Trajectory | None:
             raise ValueError(f"{len(words)} numbers, of {len(dates)} frames")
         return int(dates[at]), tables.rigid_matrix([float(word) for word in words[:12]])
 
-    def rigid(line: str) -> FloatArray:
-        return tables.rigid_matrix([float(word) for word in line.split()])
-
-    expected = "12 numbers of a rigid transform"
-    found = tables.convert_lines(calibration, rigid, expected)
+    found = tables.convert_lines(calibration, _rigid, _RIGID)
     if not found:
-        raise DatasetError(f"{calibration}: expected {expected}, got an empty file")
+        raise DatasetError(f"{calibration}: expected {_RIGID}, got an empty file")
     lidar_T_camera = found[0]
     rows = tables.convert_lines(path, frame, "a frame number and the 16 of a rigid transform")
     stamps = np.array([stamp for stamp, _ in rows], np.int64)

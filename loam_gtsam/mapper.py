@@ -85,8 +85,7 @@ class Mapper:
 
     Parameters
     ----------
-    config : of the sections about front end and sensor, only what is said of errors is used; those
-        about odometry, loops and files are not
+    config : sections on odometry, loops and files are not used, nor how features are found
     solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`; its settings,
         ``solver.config``, replace ``config.solver``. If None, :func:`make_solver` makes it
     imu : samples may be added to it while the mapper runs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import gtsam
 import numpy as np
 
@@ -107,6 +109,14 @@ class GyroTrust:
             self._given_up = min(self._given_up + 1, _LONGER)
 
 
+class OtherPose(NamedTuple):
+    """Where gyro and accelerometer alone lead, in a dispute with the scans."""
+
+    map_T_lidar: gtsam.Pose3
+    covariance: FloatArray  # (6, 6)
+    since: int  # stamp of the first frame of the dispute, nanoseconds
+
+
 class Dispute:
     """Where gyro and accelerometer lead by themselves, from when scans began to contradict them.
 
@@ -117,12 +127,14 @@ class Dispute:
     Attributes
     ----------
     holds : whether scans contradicted them so often that they are not used
+    alone, began : their state now, None if there is no dispute; and the stamp of its first frame
     frames : number of frames in which it held
     """
 
     def __init__(self) -> None:
         self.holds, self.frames = False, 0
-        self._agreed = self._began = 0  # frames before it, and the stamp of its first one
+        self._agreed = 0  # frames before it
+        self.began = 0  # stamp of its first one
         self.alone: InertialState | None = None
 
     @property
@@ -140,7 +152,7 @@ class Dispute:
         if self.alone is None:
             self._agreed += agree
             if not agree and self._agreed >= _OUTWEIGHS:
-                self.alone, self._began = predicted, predicted.stamp
+                self.alone, self.began = predicted, predicted.stamp
         elif not (contradictions or self.holds):
             self.alone = None  # by chance
         self.holds = self.holds or (self.alone is not None and contradictions >= _DISTRUST)
@@ -149,7 +161,7 @@ class Dispute:
     def ends(self, distance: float) -> bool:
         """Whether it is over, by the squared Mahalanobis distance of the scan from ``alone``."""
         assert self.alone is not None
-        return distance < _UNLIKELY or self.alone.stamp - self._began > _LONGEST
+        return distance < _UNLIKELY or self.alone.stamp - self.began > _LONGEST
 
 
 class TightCoupling:
@@ -164,6 +176,7 @@ class TightCoupling:
     turn_surprise : how the last :meth:`observe` found the predicted rotation, as a squared
         Mahalanobis distance; 0 without a prediction, and in a dispute, which bends it
     dispute : whether scans contradict gyro and accelerometer that had agreed
+    other : where these alone led at the last :meth:`observe`, in a dispute; None without one
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -174,6 +187,7 @@ class TightCoupling:
         self._contradictions = 0
         self.contradicted, self.turn_surprise = False, 0.0
         self.dispute = Dispute()
+        self.other: OtherPose | None = None
 
     @property
     def trusted(self) -> bool:
@@ -209,7 +223,7 @@ class TightCoupling:
 
         It is not before the first :meth:`observe`, nor if the samples have a gap or are absurd.
         """
-        self._predicted, self._rejected = None, False
+        self._predicted, self._rejected, self.other = None, False, None
         if self._odometry is None:
             return None
         margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
@@ -225,26 +239,12 @@ class TightCoupling:
 
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
-        self._predicted, self._rejected = None, True
+        self._predicted, self._rejected, self.other = None, True, None
 
-    def other_pose(
-        self, stamp: int, map_T_lidar: gtsam.Pose3
-    ) -> tuple[gtsam.Pose3, FloatArray] | None:
-        """Pose and covariance (6, 6) to which gyro and accelerometer alone lead in a dispute.
-
-        None if there is none. ``map_T_lidar`` is where the scans have the lidar at ``stamp``.
-        """
-        if not self.dispute.holds or self._odometry is None:
-            return None
-        assert self.dispute.alone is not None
-        if self.dispute.alone.stamp != stamp:
-            return None
-        pose, covariance = self._odometry.pose_of(self.dispute.alone)
-        away = pose.localCoordinates(map_T_lidar)
-        if self.dispute.ends(float(away @ np.linalg.solve(covariance, away))):
-            self.dispute.settle()
-            return None
-        return pose, covariance
+    def leave_out(self) -> None:
+        """Do without the IMU: its gyro is not trusted, and so there is no dispute either."""
+        self.reject()
+        self.dispute.settle()
 
     def moved(self, map_T_lidar: gtsam.Pose3, buffer: ImuBuffer) -> None:
         """Take the map, as the frame of the last :meth:`observe` sees it, to be elsewhere.
@@ -317,6 +317,7 @@ class TightCoupling:
                 count = self._contradictions + (-1 if agree else _OUTWEIGHS)
                 self._contradictions = min(max(count, 0), 2 * _DISTRUST)
                 self._compare(predicted, agree=agree)
+                self.other = self._other_pose(pose)
                 return fused if agree and self.trusted else None
             seconds = (stamp - last[0]) * 1e-9
             velocity = (pose.translation() - last[1].translation()) / seconds
@@ -341,10 +342,25 @@ class TightCoupling:
         if predicted is not None and self.turn_surprise < _TURNED:
             self.dispute.compared(predicted, self._contradictions, agree=agree)
 
+    def _other_pose(self, map_T_lidar: gtsam.Pose3) -> OtherPose | None:
+        """What is ``other`` for a lidar that the scans have at a pose; a dispute may end so."""
+        if not self.dispute.holds or self._odometry is None:
+            return None
+        assert self.dispute.alone is not None
+        pose, covariance = self._odometry.pose_of(self.dispute.alone)
+        away = pose.localCoordinates(map_T_lidar)
+        if self.dispute.ends(float(away @ np.linalg.solve(covariance, away))):
+            self.dispute.settle()
+            return None
+        return OtherPose(pose, covariance, self.dispute.began)
+
     def _carry_on(self, stamp: int, buffer: ImuBuffer) -> None:
-        """Bring what the IMU tells alone to this moment; where its samples end, so does that."""
+        """Bring what the IMU tells alone to this moment; it ends where that is absurd, or ends."""
         alone, margin = self.dispute.alone, round(self.config.max_gap * 1e9)
         if alone is None or self._odometry is None:
+            return
+        if not self._believable(alone.stamp, stamp, buffer):
+            self.dispute.settle()
             return
         samples = buffer.samples_between(alone.stamp - margin, stamp + margin)
         try:

@@ -205,7 +205,10 @@ class InertialOdometry:
 
     def carried(self, state: InertialState, stamp: int, samples: ImuSamples) -> InertialState:
         """A state of a frame, carried on to a stamp by the samples; errors of :meth:`predict`."""
-        return WindowFrame(self.config, 1, state, stamp, samples).predicted
+        predicted = WindowFrame(self.config, 1, state, stamp, samples).predicted
+        if not _has_inverse(predicted.covariance[POSE, POSE]):
+            raise SweepError("IMU samples: the covariance of the motion they make has no inverse")
+        return predicted
 
     def pose_of(self, state: InertialState) -> tuple[gtsam.Pose3, FloatArray]:
         """``map_T_lidar`` of a state, and its covariance (6, 6)."""

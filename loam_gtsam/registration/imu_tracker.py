@@ -13,7 +13,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import checked_pose
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.coupling import Dispute, GyroTrust, TightCoupling
+from loam_gtsam.imu.coupling import Dispute, GyroTrust, OtherPose, TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import NO_STEP, Fused, Prediction
@@ -50,8 +50,7 @@ class Registration(NamedTuple):
     contradicted: bool = False  # whether they predicted another pose
     problem: str = ""  # sentence for the user
     turned: FloatArray | None = None  # (3,) rad/s that the gyro turned more than the last scans
-    # Where gyro and accelerometer alone lead if scans contradict them, and its covariance (6, 6).
-    other: tuple[gtsam.Pose3, FloatArray] | None = None
+    other: OtherPose | None = None  # where gyro and accelerometer lead if scans contradict them
 
 
 def with_imu(
@@ -305,10 +304,8 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        other = self._coupling.other_pose(stamp, solution.map_T_lidar)
-        problem = self.gyro.problem or self.dispute.problem
-        told = fused, contradicted, problem, self._turns.more, other
-        return Registration(posed, solution, pose, tilt, *told)
+        told = fused, contradicted, self.gyro.problem or self.dispute.problem, self._turns.more
+        return Registration(posed, solution, pose, tilt, *told, self._coupling.other)
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.
@@ -316,8 +313,7 @@ class ImuTracker:
         To be called once a frame, before :meth:`observe` of the same stamp.
         """
         if self.config.coupling != "tight" or self.trusted_gyro is None:
-            self._coupling.reject()
-            self.dispute.settle()
+            self._coupling.leave_out()
             return None
         return self._coupling.predict(stamp, self.buffer)
 

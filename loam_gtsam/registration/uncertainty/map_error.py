@@ -34,7 +34,8 @@ class MapError:
         self._drift_factor, self._lag = config.covariance.drift, config.imu.lag
         self._velocity = MotionFilter(config.solver)
         self.drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
-        self._rivals, self._moved, self._disputed = _Rivals(), np.zeros((6, 6)), np.zeros((6, 6))
+        self._rivals, self._moved = _Rivals(), np.zeros((6, 6))
+        self._disputed: tuple[int | None, FloatArray] = None, np.zeros((6, 6))
         self._first: PosedSweep | None = None
         self._searches = config.deskew.model != "predicted"  # for the first motion
         self._origin = _Origin()
@@ -155,20 +156,16 @@ class MapError:
         self.drift = self.drift + 0.5 * (in_map @ in_map.T + expected)
 
     def add_dispute(
-        self, pose: gtsam.Pose3, step: FloatArray | None, spread: FloatArray | None
+        self, pose: gtsam.Pose3, step: FloatArray, expected: FloatArray, since: int
     ) -> None:
-        """As :meth:`add_jump`, of all frames since an IMU began to lead elsewhere.
+        """As :meth:`add_jump`, of all frames ``since`` an IMU began to lead elsewhere, nanoseconds.
 
-        ``step`` (6,) leads there, with the covariance ``spread`` (6, 6); None if it does not. The
-        error grows as the two part, and stays when the dispute is over.
+        The error grows as the two part, and stays when the dispute is over.
         """
-        if step is None or spread is None:
-            self._disputed = np.zeros((6, 6))
-            return
+        known = self._disputed[1] if self._disputed[0] == since else np.zeros((6, 6))
         in_map = pose.AdjointMap() @ step
-        grown = 0.5 * (np.outer(in_map, in_map) + spread) - self._disputed
-        more = nearest_positive(grown)
-        self._disputed = self._disputed + more
+        more = nearest_positive(0.5 * (np.outer(in_map, in_map) + expected) - known)
+        self._disputed = since, known + more
         self.drift = self.drift + more
 
     def add_expected(self, motion: MotionPrior) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import symmetric, transform
+from loam_gtsam.imu.coupling import OtherPose
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
@@ -250,13 +251,13 @@ class PoseErrors:
         elif np.array_equal(posed.twist, expected.posed.twist):
             self._own.stray(step)
 
-    def disputed(self, pose: gtsam.Pose3, other: tuple[gtsam.Pose3, FloatArray] | None) -> None:
-        """Account for another pose, with its covariance (6, 6), to which an IMU alone leads."""
-        step = spread = None
-        if other is not None:
-            to_map = other[0].AdjointMap()
-            step, spread = pose.localCoordinates(other[0]), to_map @ other[1] @ to_map.T
-        self._map.add_dispute(pose, step, spread)
+    def disputed(self, pose: gtsam.Pose3, other: OtherPose | None) -> None:
+        """Account for another pose to which an IMU alone leads; None if there is none."""
+        if other is None:
+            return
+        to_map = other.map_T_lidar.AdjointMap()
+        step = pose.localCoordinates(other.map_T_lidar)
+        self._map.add_dispute(pose, step, to_map @ other.covariance @ to_map.T, other.since)
 
     def moved(self, step: gtsam.Pose3) -> None:
         """As :meth:`MapError.add_move`."""

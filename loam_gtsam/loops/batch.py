@@ -156,7 +156,7 @@ def optimize_graph(
 
 
 def _check(saved: SavedGraph) -> None:
-    check_kind(saved, SavedGraph, "graph", "read_graph(path) reads one")
+    check_kind(saved, SavedGraph, "graph", "read_graph(path) and PoseGraph.saved() make one")
     keys = sorted(saved.poses.keys())
     if not saved.keys:
         raise InputError(f"graph: expected poses, got none among {len(keys)} variables")

@@ -76,6 +76,11 @@ def is_number(value: object) -> bool:
     return isinstance(value, Real) and not math.isnan(value)
 
 
+def is_whole(value: object) -> bool:
+    """Whether it is a whole number, and no flag."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
 def as_path(value: object, name: str = "path") -> Path:
     """A path; InputError for anything but a text or a path."""
     if not isinstance(value, (str, os.PathLike)):
@@ -85,8 +90,8 @@ def as_path(value: object, name: str = "path") -> Path:
 
 def check_count(value: object, name: str, *, optional: bool = False) -> None:
     """InputError for anything but a whole number, not negative; None is one if it is optional."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0
-    if not (whole or (optional and value is None)):
+    counted = is_whole(value) and value >= 0  # type: ignore[operator]
+    if not (counted or (optional and value is None)):
         wanted = "a whole number, 0 or more" + (", or None" if optional else "")
         raise InputError(f"{name}: expected {wanted}, got {value!r}")
 
@@ -129,7 +134,7 @@ def check_array(
     """
     _check_unmasked(value, name)
     named = {"integer": "iu", "float": "f", "flag": "b"}
-    kinds = next((kinds for name, kinds in named.items() if name in numbers), "fiu")
+    kinds = next((kind for word, kind in named.items() if word in numbers), "fiu")
     got = type(value).__name__
     if isinstance(value, np.ndarray):
         same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]

@@ -15,6 +15,7 @@ from loam_gtsam.errors import (
     as_stamps,
     check_array,
     check_kind,
+    is_whole,
 )
 from loam_gtsam.trajectory import FloatArray, IntArray, checked_pose
 
@@ -66,7 +67,7 @@ class Scan:
                 check_array(column, f"Scan.{name}", (len(self.points),), numbers)
         if self.span is not None:
             _check_span(self, self.span)
-        if not (_is_integer(self.rows) and self.rows >= 0):
+        if not (is_whole(self.rows) and self.rows >= 0):
             raise InputError(f"Scan.rows: expected a number of rows, or 0, got {self.rows!r}")
         if self.rows and len(self.points) % self.rows:
             raise InputError(
@@ -74,15 +75,11 @@ class Scan:
             )
 
 
-def _is_integer(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
 def _check_stamp(sweep: Scan | Features | BadSweep) -> None:
     """InputError unless the stamp makes sense, which becomes an int; any may do for a bad sweep."""
     stamp = sweep.stamp
     bounded = not isinstance(sweep, BadSweep)
-    if not _is_integer(stamp) or (bounded and abs(int(stamp)) > MAX_STAMP):
+    if not is_whole(stamp) or (bounded and abs(int(stamp)) > MAX_STAMP):
         raise InputError(
             f"{type(sweep).__name__}.stamp: expected integer nanoseconds up to 2^62 (the year "
             f"2116), got {stamp!r}; round(seconds * 1e9) makes them of seconds"

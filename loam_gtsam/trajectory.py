@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
+from loam_gtsam.errors import InputError, as_stamps, check_all, check_array, check_kind
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -53,9 +53,8 @@ class Trajectory:
         """N poses at N stamps in nanoseconds; InputError for anything else."""
         check_kind(poses, Iterable, "poses", "a list of gtsam.Pose3 is one")
         poses = list(poses)
-        for number, pose in enumerate(poses):
-            how = "Trajectory(stamps, matrices) takes an array of (N, 4, 4)"
-            check_kind(pose, gtsam.Pose3, f"poses[{number}]", how)
+        how = "Trajectory(stamps, matrices) takes an array of (N, 4, 4)"
+        check_all(poses, gtsam.Pose3, "poses", how)
         return cls(as_stamps(stamps, "stamps"), stack_poses(poses))
 
     def __len__(self) -> int:

@@ -28,6 +28,7 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
+from loam_gtsam.errors import check_all
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
 from loam_gtsam.sweeps import MAX_STAMP as MAX_STAMP
@@ -253,3 +254,8 @@ class MapUpdate:
             with suppress(np.linalg.LinAlgError):
                 return np.asarray(np.linalg.inv(self.information), np.float64)
         return np.full((6, 6), np.nan)
+
+
+def check_updates(updates: object, name: str = "updates") -> None:
+    """InputError for anything but a sequence of :class:`MapUpdate`."""
+    check_all(updates, MapUpdate, name, "result.updates of a run are such")

@@ -94,12 +94,10 @@ def open_dataset(path: str | Path, **options: Any) -> LoadedDataset:
     DatasetError
         If nothing is there, it is of no known kind, or an option does not belong to it.
     """
-    as_path(path)
     options = {key: value for key, value in options.items() if value is not None}
-    text = str(path)
+    text, path = str(path), as_path(path)
     if text.startswith("sim:"):
         return _open_world(text, options)
-    path = Path(path)
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder; expected {_ACCEPTED}")
     if path.is_file() and path.suffix not in _BAG_FILES:

@@ -20,7 +20,7 @@ from loam_gtsam.imu.preintegration import (
     StartSigmas,
 )
 from loam_gtsam.imu.preintegration_window import GRAVITY, VELOCITY, InertialState
-from loam_gtsam.types import FloatArray, SweepError
+from loam_gtsam.types import FloatArray, ImuSamples, SweepError
 
 _FORCE = 0.2, 3.0
 """Least and largest mean specific force over a sweep, in multiples of gravity. Less is free fall,
@@ -226,10 +226,9 @@ class TightCoupling:
         self._predicted, self._rejected, self.other = None, False, None
         if self._odometry is None:
             return None
-        margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
-        if not self._believable(since, stamp, buffer):
+        samples = self._samples(self._odometry.state.stamp, stamp, buffer)
+        if samples is None:
             return None
-        samples = buffer.samples_between(since - margin, stamp + margin)
         try:
             prediction = self._odometry.predict(stamp, samples)
         except SweepError:
@@ -356,13 +355,13 @@ class TightCoupling:
 
     def _carry_on(self, stamp: int, buffer: ImuBuffer) -> None:
         """Bring what the IMU tells alone to this moment; it ends where that is absurd, or ends."""
-        alone, margin = self.dispute.alone, round(self.config.max_gap * 1e9)
+        alone = self.dispute.alone
         if alone is None or self._odometry is None:
             return
-        if not self._believable(alone.stamp, stamp, buffer):
+        samples = self._samples(alone.stamp, stamp, buffer)
+        if samples is None:
             self.dispute.settle()
             return
-        samples = buffer.samples_between(alone.stamp - margin, stamp + margin)
         try:
             self.dispute.alone = self._odometry.carried(alone, stamp, samples)
         except SweepError:
@@ -384,6 +383,13 @@ class TightCoupling:
         before = state.covariance[VELOCITY, VELOCITY] + grown**2 * np.eye(3)
         gain = before @ np.linalg.inv(before + spread + doubt)
         return state.velocity + gain @ away, symmetric(gain @ (spread + doubt)) + doubt
+
+    def _samples(self, first: int, last: int, buffer: ImuBuffer) -> ImuSamples | None:
+        """What was felt between two stamps, and a gap's length about; None if it is absurd."""
+        if not self._believable(first, last, buffer):
+            return None
+        margin = round(self.config.max_gap * 1e9)
+        return buffer.samples_between(first - margin, last + margin)
 
     def _believable(self, first: int, last: int, buffer: ImuBuffer) -> bool:
         """Whether a lidar that is carried about may feel what it felt between two stamps."""

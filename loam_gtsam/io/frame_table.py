@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.errors import check_all
-from loam_gtsam.types import TANGENT, MapUpdate, OutputError, stack_poses
+from loam_gtsam.types import TANGENT, MapUpdate, OutputError, check_updates, stack_poses
 
 _PLAIN = ("n_edges", "n_planes", "n_edge_matches", "n_plane_matches", "iterations", "error_after")
 
@@ -43,7 +42,7 @@ def to_dataframe(updates: Sequence[MapUpdate]) -> Any:
         raise OutputError(
             'a table needs pandas; install it with: pip install "loam_gtsam[pandas]"'
         ) from error
-    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
+    check_updates(updates)
     stamps = np.array([update.stamp for update in updates], np.int64)
     poses = stack_poses(update.map_T_lidar for update in updates)
     columns: dict[str, Any] = {"seconds": (stamps - stamps[:1]) * 1e-9}

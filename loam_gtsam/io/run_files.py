@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import dump_config
-from loam_gtsam.errors import check_all, check_kind
+from loam_gtsam.errors import check_kind
 from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
 from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
@@ -27,6 +27,7 @@ from loam_gtsam.types import (
     MapUpdate,
     Uncertainty,
     check_array,
+    check_updates,
     stack_poses,
 )
 
@@ -63,7 +64,7 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     rad m and m^2, along the axes of the lidar; empty where the frame was not solved. Frames with a
     bad stamp are left out.
     """
-    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
+    check_updates(updates)
     rows, columns = np.triu_indices(6)
     names = [f"{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(rows, columns, strict=True)]
     lines = [",".join(("stamp_s", "status", *names))]
@@ -88,7 +89,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 
     docs/outputs.md lists the keys; :class:`loam_gtsam.types.MapUpdate` says what the values mean.
     """
-    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
+    check_updates(updates)
     nothing = np.full((6, 6), np.nan)
     rest = np.nan, np.nan, np.full((6, 10), np.nan), np.full(10, np.nan)
     unknown = Uncertainty(nothing, nothing, None, nothing, *rest)

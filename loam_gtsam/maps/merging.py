@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.aiding.placed_fixes import MAP_KEY, PlacedFixes
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
+from loam_gtsam.errors import check_all
 from loam_gtsam.geometry import symmetric, transform_each
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import LoopClosure, pose_key
@@ -32,7 +33,6 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     Trajectory,
-    check_kind,
     stack_poses,
 )
 from loam_gtsam.voxels.archive import Archive
@@ -128,8 +128,7 @@ def merge_maps(
     """
     if len(maps) < 2:
         raise InputError(f"merge: expected two maps or more, got {len(maps)}")
-    for number, saved in enumerate(maps):
-        check_kind(saved, SavedMap, f"maps[{number}]", "SavedMap(path) opens one")
+    check_all(maps, SavedMap, "maps", "SavedMap(path) opens one")
     config = config or maps[0].config
     _check(maps)
     common = CommonPlaces(maps, config)

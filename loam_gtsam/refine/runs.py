@@ -12,7 +12,6 @@ import numpy as np
 from loam_gtsam.config import Config, SolverConfig, as_config
 from loam_gtsam.datasets.base import Dataset, check_dataset, sweeps_of_run
 from loam_gtsam.datasets.decode.geodesy import GeoReference
-from loam_gtsam.errors import check_all
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import pose_number
@@ -46,6 +45,7 @@ from loam_gtsam.types import (
     SweepError,
     Trajectory,
     check_kind,
+    check_updates,
     stack_poses,
 )
 
@@ -99,7 +99,7 @@ def run_points(
     used: list[SweepPoints] = []
     held: list[SweepPoints] = []
     check_dataset(dataset)
-    check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
+    check_updates(updates)
     check_placed(updates)
     config = as_config(config)
     sweeps = sweeps_of_run(dataset, len(updates))
@@ -344,7 +344,7 @@ class _Run:
         points: RunPoints, updates: Sequence[MapUpdate], trajectory: Trajectory | None, name: str
     ) -> _Run:
         check_kind(points, RunPoints, "points", "run_points(dataset, updates, config) makes them")
-        check_all(updates, MapUpdate, "updates", "result.updates of a run are such")
+        check_updates(updates)
         if (needed := 1 + max(points.frames, default=-1)) > len(updates):
             got = f"expected all of the run, {needed} or more, got {len(updates)}"
             raise InputError(f"updates: {got}")

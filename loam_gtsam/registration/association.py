@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.errors import check_array, check_kind
-from loam_gtsam.geometry import cross, dot, fit_lines, norm, transform
+from loam_gtsam.geometry import checked_pose, cross, dot, fit_lines, norm, transform
 from loam_gtsam.registration.matches import (
     ChosenRows,
     EdgeMatches,
@@ -63,7 +63,7 @@ def associate(
     """
     for name, features in {"edges": edges, "planes": planes}.items():
         check_array(features, name, ("N", 3))
-    check_kind(map_T_lidar, gtsam.Pose3, "map_T_lidar", "gtsam.Pose3(matrix) makes one")
+    checked_pose(map_T_lidar, "map_T_lidar")
     for name, cubes in {"edge_map": edge_map, "plane_map": plane_map}.items():
         check_kind(cubes, CubeMap, name, "mapper.maps.edges and mapper.maps.planes are such")
     check_kind(config, MatchingConfig, "config", "it is config.matching")

@@ -89,7 +89,8 @@ def match_surfaces(
     here = points_map.take(rows, axis=0).T
     sight = map_T_lidar[:3, 3:] - here
     sight /= np.maximum(norm(sight), _TINY)
-    side, least = dot(fits.normals, sight), _least_sines(fits, config)
+    side = dot(fits.normals, sight)
+    least = _least_sines(config.point_sigma, k, fits.eigenvalues[1])
     views, own = near.views.take(rows, axis=0), _towards(fits.normals, sight, least)
     normals, surely = _wide_surfaces(here, fits.normals, config)
     facing = np.where(surely < least, _towards(normals, sight, surely), own)
@@ -165,10 +166,15 @@ def _towards(normals: FloatArray, sight: FloatArray, least: FloatArray) -> Float
     return turned
 
 
-def _least_sines(fits: _Fits, config: MatchingConfig) -> FloatArray:
-    """(M,) sines of the angles from which on a view is beyond the error of the normal."""
-    spread = np.maximum(fits.eigenvalues[1], _TINY)
-    least: FloatArray = _SURE * config.point_sigma / np.sqrt(config.neighbours * spread)
+def _least_sines(
+    sigma: float | FloatArray, count: int | IntArray, spread: FloatArray
+) -> FloatArray:
+    """(M,) sines of the angles from which on a view is beyond the error of the normal.
+
+    That is of ``count`` points, off their plane by ``sigma``, with the variance ``spread`` (M,)
+    along their narrow extent.
+    """
+    least: FloatArray = _SURE * sigma / np.sqrt(count * np.maximum(spread, _TINY))
     return least
 
 
@@ -188,7 +194,7 @@ def _wide_surfaces(
     size = np.where(axis == np.arange(3)[:, None], _THICK, _WIDE)
     corner = np.floor(points / size)
     x, y, z = corner.astype(np.int64) & _KEY
-    keys = (((x * (_KEY + 1) + y) * (_KEY + 1) + z) << 2) + axis
+    keys = (x << 38) | (y << 20) | (z << 2) | axis
     counts, cells = np.unique(keys, return_inverse=True, return_counts=True)[:0:-1]
     away = points - corner * size
     away -= np.array([np.bincount(cells, along) / counts for along in away])[:, cells]
@@ -197,7 +203,7 @@ def _wide_surfaces(
     covariance = np.array([np.bincount(cells, a * b) / counts for a, b in pairs])
     eigenvalues = symmetric_eigenvalues(covariance)
     sigma = np.maximum(np.sqrt(np.maximum(eigenvalues[0], 0.0)), config.point_sigma)
-    least = (_SURE * sigma / np.sqrt(np.maximum(counts * eigenvalues[1], _TINY)))[cells]
+    least = _least_sines(sigma, counts, eigenvalues[1])[cells]
     whole = symmetric_eigenvector(covariance, eigenvalues[0])[:, cells]
     least[norm(cross(whole, normals)) > _UNLIKE] = np.inf
     return whole, least

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
-from loam_gtsam.errors import check_all, check_count
+from loam_gtsam.errors import check_count
 from loam_gtsam.geometry import as_array, five_sigma, inverse_pose, transform
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.trajectory import check_increasing
@@ -27,6 +27,7 @@ from loam_gtsam.types import (
     MapUpdate,
     Trajectory,
     check_kind,
+    check_updates,
 )
 
 _NO_SPREAD = 1e-9
@@ -111,9 +112,7 @@ def matched_truth(trajectory: Trajectory, reference: Trajectory) -> Trajectory:
     Poses outside the time span of the reference have none. Raises InputError if the stamps of the
     reference do not increase.
     """
-    for one in (trajectory, reference):
-        check_kind(one, Trajectory, "matched_truth", "a run and a data set have one")
-    check_increasing(reference, "matched_truth")
+    _check_both("matched_truth", trajectory, reference)
     stamps = trajectory.stamps
     inside = (stamps >= reference.stamps[0]) & (stamps <= reference.stamps[-1])
     common: IntArray = stamps[inside]
@@ -302,7 +301,7 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
         If no update lies inside the reference, its stamps do not increase, or it has positions
         alone.
     """
-    check_all(updates, MapUpdate, "nees: updates", "result.updates of a run are such")
+    check_updates(updates, "nees: updates")
     check_count(window, "nees: window")
     check_kind(reference, Trajectory, "nees: reference", "the truth of a data set is one")
     check_increasing(reference, "nees")
@@ -391,9 +390,7 @@ def _common(
     The stamps are those of the estimate inside the reference's time span. A sparse reference, as of
     surveyed points at which the lidar stands, is not interpolated: then they are its own.
     """
-    for trajectory in (estimate, reference):
-        check_kind(trajectory, Trajectory, caller, "a run and a data set have one")
-    check_increasing(reference, caller)
+    _check_both(caller, estimate, reference)
     if len(reference) > 1 and np.median(np.diff(reference.stamps)) > _SPARSE_NS:
         fine, coarse, which = estimate, reference, "points of the sparse reference, inside the run"
     else:
@@ -425,6 +422,12 @@ def _common(
     if reference.point is not None:
         poses = poses @ rigid_transform(Rotation.identity(), reference.point)
     return stamps, poses, truth
+
+
+def _check_both(caller: str, estimate: Trajectory, reference: Trajectory) -> None:
+    for trajectory in (estimate, reference):
+        check_kind(trajectory, Trajectory, caller, "a run and a data set have one")
+    check_increasing(reference, caller)
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:

@@ -78,10 +78,10 @@ def blend_direction(
 
     Parameters are those of :func:`blend`; ``map_up`` is :attr:`~loam_gtsam.imu.level.Level.map_up`.
     """
-    own = map_T_lidar.rotation().matrix().T @ map_up
+    lidar = map_T_lidar.rotation().matrix().T @ map_up
     imu = np.array(measured.matrix()[2])
-    axis = np.cross(own, imu)
-    sine, cosine = float(np.linalg.norm(axis)), float(own @ imu)
+    axis = np.cross(lidar, imu)
+    sine, cosine = float(np.linalg.norm(axis)), float(lidar @ imu)
     if sine < np.finfo(np.float64).eps:
         return map_T_lidar
     turn = gtsam.Rot3.Expmap(-weight * np.arctan2(sine, cosine) * axis / sine)
@@ -90,9 +90,9 @@ def blend_direction(
 
 def blended_angles(level_R_lidar: gtsam.Rot3, measured: gtsam.Rot3, weight: float) -> FloatArray:
     """(2,) roll and pitch, ``(1 - weight)`` of the first and ``weight`` of the second."""
-    own, imu = roll_pitch(level_R_lidar), roll_pitch(measured)
-    imu += 2.0 * np.pi * np.round((own - imu) / (2.0 * np.pi))
-    angles: FloatArray = (1.0 - weight) * own + weight * imu
+    lidar, imu = roll_pitch(level_R_lidar), roll_pitch(measured)
+    imu += 2.0 * np.pi * np.round((lidar - imu) / (2.0 * np.pi))
+    angles: FloatArray = (1.0 - weight) * lidar + weight * imu
     return angles
 
 

@@ -188,8 +188,8 @@ class Pipeline:
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
         self.config = self.mapper.config
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        own = parts.get("odometry") or aided_odometry(self.config, wheels, self.mapper.imu)
-        self.odometry = own or make_odometry(self.config.odometry, self.mapper.imu)
+        chosen = parts.get("odometry") or aided_odometry(self.config, wheels, self.mapper.imu)
+        self.odometry = chosen or make_odometry(self.config.odometry, self.mapper.imu)
         self._wheels = wheels
         self._features = parts.get("features")
         self._last_odom: gtsam.Pose3 | None = None

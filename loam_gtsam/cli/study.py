@@ -111,8 +111,8 @@ def _medians(spec: Spec, rows: Sequence[trials.Row], metric: str) -> TextTable:
         cells = []
         for config in spec.config_names:
             wanted = (sequence, config, None)
-            own = (r for r in rows if (r["sequence"], r["config"], r["error"]) == wanted)
-            values = [row[metric] for row in own if row[metric] is not None]
+            found = (r for r in rows if (r["sequence"], r["config"], r["error"]) == wanted)
+            values = [row[metric] for row in found if row[metric] is not None]
             cells.append(f"{statistics.median(values):.4g}" if values else "-")
         table.append([sequence, *cells])
     return TextTable(["sequence", *spec.config_names], table)

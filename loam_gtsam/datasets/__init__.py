@@ -153,10 +153,10 @@ def _open_bag(path: Path, options: dict[str, Any]) -> LoadedDataset:
     with closing(open_bag(path)) as reader:
         loam, rig = reader.topics.keys() >= set(REQUIRED), rig_of(reader.topics.keys())
     plain = (BagOptions.__annotations__.keys() - {"imu_topic"}) & options.keys()
-    own = "axes" in options or (loam and not plain)
+    of_loam = "axes" in options or (loam and not plain)
     known = rig is not None and options.get("topic") in (None, rig.topic)
     plain_bag = RigBag if known else BagDataset
-    return _construct(LoamTopicsDataset if own else plain_bag, path, options)
+    return _construct(LoamTopicsDataset if of_loam else plain_bag, path, options)
 
 
 def _open_world(text: str, options: dict[str, Any]) -> LoadedDataset:

@@ -145,9 +145,9 @@ def _made(
         if not isinstance(entry, np.ndarray) or entry.ndim != 2 or entry.shape[1] not in (3, 4):
             got = entry.shape if isinstance(entry, np.ndarray) else type(entry).__name__
             raise InputError(f"scans[{index}]: expected an (N, 3) or (N, 4) array, got {got}")
-        own = None if times is None else times[index], None if rings is None else rings[index]
+        columns = None if times is None else times[index], None if rings is None else rings[index]
         try:
-            scans.append(Scan(entry[:, :3], int(stamps[index]), *own))
+            scans.append(Scan(entry[:, :3], int(stamps[index]), *columns))
         except InputError as error:
             raise InputError(f"scans[{index}]: {error}") from error
     return scans

@@ -99,8 +99,8 @@ def find_poles(
     if depth <= 0.0:
         nothing = np.zeros(0, np.int64)
         return Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0), np.zeros(0))
-    own = ring_starts[1:] > ring_starts[:-1]
-    heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
+    filled = ring_starts[1:] > ring_starts[:-1]
+    heads, tails = ring_starts[:-1][filled], ring_starts[1:][filled] - 1
     ranges = np.sqrt(squared_norm(xyz))
     beams = xyz / ranges
     turn = np.sqrt(squared_norm(_to_next(beams, heads, tails)))

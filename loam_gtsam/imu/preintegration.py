@@ -279,12 +279,12 @@ class InertialOdometry:
             return None
         to_lidar = np.eye(VELOCITY.stop)
         to_lidar[POSE, POSE] = self._to_lidar
-        own, across = (
+        of_lidar, across = (
             to_lidar @ whole[: VELOCITY.stop, : VELOCITY.stop] @ to_lidar.T
             for whole in (self.state.covariance, left @ frame.transition @ before)
         )
         pose, velocity = self._of_lidar(self.state, frame.rate)
-        return Fused(pose, velocity, own, across, self.state.gyro_bias)
+        return Fused(pose, velocity, of_lidar, across, self.state.gyro_bias)
 
     def restart(
         self,

@@ -256,12 +256,12 @@ def _known(state: InertialState) -> gtsam.HessianFactor:
     parts = (X(0), POSE), (V(0), VELOCITY), (B(0), BIASES), (G(0), GRAVITY)
     graph = gtsam.GaussianFactorGraph()
     for key, rows in parts:
-        own = information[rows, rows]
-        graph.add(gtsam.HessianFactor(key, own, np.zeros(len(own)), 0.0))
+        block = information[rows, rows]
+        graph.add(gtsam.HessianFactor(key, block, np.zeros(len(block)), 0.0))
     for (key, rows), (other, columns) in combinations(parts, 2):
         across = information[rows, columns]
-        own, theirs = (np.zeros((size, size)) for size in across.shape)
-        sides = own, across, own[0], theirs, theirs[0]
+        first, second = (np.zeros((size, size)) for size in across.shape)
+        sides = first, across, first[0], second, second[0]
         graph.add(gtsam.HessianFactor(key, other, *sides, 0.0))
     return gtsam.HessianFactor(graph)
 

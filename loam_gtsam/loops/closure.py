@@ -305,11 +305,11 @@ class ScanLoopCloser:
 
     def _alike(self, index: int, near: IntArray) -> list[tuple[int, float]]:
         """The candidates that look most alike, and how the lidar is turned against each."""
-        own = self._descriptors[index]
+        descriptor = self._descriptors[index]
         tree = cKDTree([heading_free_key(self._descriptors[other]) for other in near.tolist()])
-        _, found = tree.query(heading_free_key(own), k=min(_ALIKE, len(near)))
+        _, found = tree.query(heading_free_key(descriptor), k=min(_ALIKE, len(near)))
         compared = [
-            (*compare_descriptors(self._descriptors[other], own), other)
+            (*compare_descriptors(self._descriptors[other], descriptor), other)
             for other in near[np.sort(np.atleast_1d(found))].tolist()
         ]
         chosen: list[tuple[int, float]] = []

@@ -221,8 +221,10 @@ def relative_pose(
     between = poses.atPose3(earlier).between(poses.atPose3(later))
     joint = marginals.jointMarginalCovariance([earlier, later])
     to_later = between.inverse().AdjointMap()
-    own, crossed = joint.at(earlier, earlier), to_later @ joint.at(earlier, later)
-    return between, to_later @ own @ to_later.T + joint.at(later, later) - crossed - crossed.T
+    of_earlier, crossed = joint.at(earlier, earlier), to_later @ joint.at(earlier, later)
+    return between, to_later @ of_earlier @ to_later.T + joint.at(
+        later, later
+    ) - crossed - crossed.T
 
 
 def _new_isam() -> gtsam.ISAM2:

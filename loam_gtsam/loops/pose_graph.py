@@ -277,21 +277,21 @@ class PoseGraph(FactorGraph):
         """What leads to a new keyframe: odometry from the last one, which may be forgotten now."""
         motion, covariance = odometry_between(last, new, self.config)
         way = new.travelled - last.travelled
-        own = [loop for loop in self.loops if loop.later == last.index]
+        ended = [loop for loop in self.loops if loop.later == last.index]
         if (
             last.index != self.visits.surplus
             or self.visits.last is None
             or self._graph.factors.size() != self.visits.last[1]  # it has a factor of a user's own
-            or not all(self.active[len(self.loops) - len(own) :])  # it may be right some day
+            or not all(self.active[len(self.loops) - len(ended) :])  # it may be right some day
         ):
             return Tie(last.index, motion, covariance, way)
         tie = self.visits.last[0]
-        base, gone = (own[-1].earlier, 0.0) if own else (tie.base, tie.way)
+        base, gone = (ended[-1].earlier, 0.0) if ended else (tie.base, tie.way)
         tie = Tie(base, *self.relative(base, last.index), gone)
         self.visits.forget(last, tie)
         self.keyframes.pop()
-        self._selection.forget(len(own))
-        self._graph.forget(len(own))
+        self._selection.forget(len(ended))
+        self._graph.forget(len(ended))
         to_new = motion.inverse().AdjointMap()
         covariance = covariance + to_new @ tie.covariance @ to_new.T
         tie = Tie(tie.base, tie.base_T_lidar.compose(motion), covariance, tie.way + way)

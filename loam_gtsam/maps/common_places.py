@@ -111,7 +111,7 @@ class CommonPlaces:
         self._keys = np.array([heading_free_key(one) for one in self._descriptors])
         self._submap = lru_cache(_SUBMAPS)(self._make_submap)
         self._keyframes = _keyframes(maps)
-        self._own = [error for saved in maps for error in _own_errors(saved)]
+        self._errors = [error for saved in maps for error in _place_errors(saved)]
 
     @property
     def stretch(self) -> float:
@@ -128,10 +128,10 @@ class CommonPlaces:
         chosen: list[int] = []
         last: tuple[int, gtsam.Pose3] | None = None
         for number, place in enumerate(self.places):
-            own, pose = int(self.map_of[number]), place.map_T_middle
-            if own and (last is None or last[0] != own or last[1].range(pose) >= self._apart):
+            drive, pose = int(self.map_of[number]), place.map_T_middle
+            if drive and (last is None or last[0] != drive or last[1].range(pose) >= self._apart):
                 chosen.append(number)
-                last = own, pose
+                last = drive, pose
         return chosen
 
     def find(self, number: int) -> list[LoopClosure]:
@@ -145,9 +145,9 @@ class CommonPlaces:
         if not found:
             return []
         pose = self.places[number].map_T_middle
-        own = np.flatnonzero(self.map_of == self.map_of[number])
+        same_map = np.flatnonzero(self.map_of == self.map_of[number])
         least = 2.0 * self._config.loops.search
-        far = [n for n in own.tolist() if pose.range(self.places[n].map_T_middle) > least]
+        far = [n for n in same_map.tolist() if pose.range(self.places[n].map_T_middle) > least]
         for twin in self._alike(number, np.array(far, np.int64), _TWINS):
             if not same(twin.earlier_T_later, self.places[twin.earlier].map_T_middle.between(pose)):
                 return []
@@ -158,9 +158,9 @@ class CommonPlaces:
         if not len(others):
             return []
         _, near = cKDTree(self._keys[others]).query(self._keys[number], k=min(_ALIKE, len(others)))
-        own = self._descriptors[number]
+        descriptor = self._descriptors[number]
         compared = [
-            (*compare_descriptors(self._descriptors[other], own), other)
+            (*compare_descriptors(self._descriptors[other], descriptor), other)
             for other in others[np.sort(np.atleast_1d(near))].tolist()
         ]
         tried: list[int] = []
@@ -194,8 +194,10 @@ class CommonPlaces:
         if isinstance(found, Rejection):
             self.rejected[found] += 1
             return None
-        to_own = found.pose.inverse().AdjointMap()
-        covariance = found.covariance + self._own[number] + to_own @ self._own[other] @ to_own.T
+        to_place = found.pose.inverse().AdjointMap()
+        covariance = (
+            found.covariance + self._errors[number] + to_place @ self._errors[other] @ to_place.T
+        )
         return LoopClosure(other, number, found.pose, symmetric(covariance), *astuple(found.fit))
 
     def agreeing(self, loops: Sequence[LoopClosure]) -> tuple[list[LoopClosure], int]:
@@ -246,7 +248,7 @@ def walked(saved: SavedMap) -> list[LoopClosure]:
     ]
 
 
-def _own_errors(saved: SavedMap) -> list[FloatArray]:
+def _place_errors(saved: SavedMap) -> list[FloatArray]:
     """(6, 6) by which the sweep of each place lies off the map around it, in its axes.
 
     A motion has the errors of both ends in its covariance.

@@ -143,39 +143,39 @@ class PlaceSearch:
         like one of those that are, if these look alike. So rivals are all poses, too, that fit
         nearly as well: to that share ``far`` away, or to :data:`AS_WELL` where the same is seen.
         """
-        own = _at(pose, found)
-        if own is None:
+        here = _at(pose, found)
+        if here is None:
             return found
-        return [c for c in found if c is not own and self._may_be(c, own, far)]
+        return [c for c in found if c is not here and self._may_be(c, here, far)]
 
-    def _may_be(self, other: Candidate, own: Candidate, far: float) -> bool:
+    def _may_be(self, other: Candidate, here: Candidate, far: float) -> bool:
         """Whether another pose may be the right one as well; see :meth:`rivals`."""
-        if not self._favoured(own, other):
+        if not self._favoured(here, other):
             return True
-        near = other.map_T_middle.range(own.map_T_middle) < self._config.loops.search
-        nearly = (AS_WELL if near else far) * own.fit.total
+        near = other.map_T_middle.range(here.map_T_middle) < self._config.loops.search
+        nearly = (AS_WELL if near else far) * here.fit.total
         return not self._inside and other.fit.total >= nearly
 
     def fits_better(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
         """Whether the map fits better at another pose, to which the sweep does not object."""
-        own = _at(pose, found)
-        return own is None or any(
-            c.fit.total > own.fit.total and not self._favoured(own, c) for c in found
+        here = _at(pose, found)
+        return here is None or any(
+            c.fit.total > here.fit.total and not self._favoured(here, c) for c in found
         )
 
     def refuted(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
         """Whether a sweep speaks against a pose and for another one, or was not found there."""
-        own = _at(pose, found)
-        return own is None or any(self._favoured(c, own) for c in found)
+        here = _at(pose, found)
+        return here is None or any(self._favoured(c, here) for c in found)
 
     def _lookalikes(self, points: FloatArray) -> list[gtsam.Pose3]:
         """Poses at the places that look most alike."""
-        own, places = scan_context(points, self._config.loops), self._places
-        _, near = self._tree.query(heading_free_key(own), k=min(_ALIKE, len(places)))
+        seen, places = scan_context(points, self._config.loops), self._places
+        _, near = self._tree.query(heading_free_key(seen), k=min(_ALIKE, len(places)))
         compared = []
         for number in np.sort(np.atleast_1d(near)).tolist():
             descriptor = places[number].descriptor.astype(np.float64)
-            compared.append((*compare_descriptors(descriptor, own), number))
+            compared.append((*compare_descriptors(descriptor, seen), number))
         turned = (
             places[number].map_T_middle.compose(gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3)))
             for _, turn, number in sorted(compared)

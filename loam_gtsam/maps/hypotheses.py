@@ -93,7 +93,7 @@ class Motion:
         self._config = config
         few = trial_matching(config.matching)
         self._mapper = Mapper(config.changed({"map.archive_megabytes": 0.0}, matching=few))
-        self._map_T_own: gtsam.Pose3 | None = None  # frame of this map in the saved one, if known
+        self._map_T_local: gtsam.Pose3 | None = None  # frame of this map in the saved one, if known
         self._apart = APART  # metres and rad by which that may be wrong
         self._last = gtsam.Pose3()
         self.way = 0.0
@@ -102,12 +102,12 @@ class Motion:
         """Begin with tracked sweeps, and others after these; ``known`` is the last tracked one."""
         metres, rad = three_sigma(known)
         self._apart = APART[0] + metres, APART[1] + rad
-        self._map_T_own = gtsam.Pose3()
+        self._map_T_local = gtsam.Pose3()
         for features in sweeps:
-            own = self.register(features)
-            if features.stamp == known.stamp and self._map_T_own is not None:
-                self._map_T_own = known.map_T_lidar.compose(own.map_T_lidar.inverse())
-        if self._map_T_own is None:
+            moved = self.register(features)
+            if features.stamp == known.stamp and self._map_T_local is not None:
+                self._map_T_local = known.map_T_lidar.compose(moved.map_T_lidar.inverse())
+        if self._map_T_local is None:
             self._mapper.reset()
 
     def register(self, features: Features) -> MapUpdate:
@@ -117,18 +117,18 @@ class Motion:
             return moved
         if not moved.status.solved or not self._fits(moved):
             self._mapper.reset()  # it may be anywhere now
-            moved, self._map_T_own = self._mapper.register(features), None
+            moved, self._map_T_local = self._mapper.register(features), None
             self.way = np.inf
         self.way += self._last.range(moved.map_T_lidar)
         self._last = moved.map_T_lidar
         if self.way * self._config.loops.gate_drift > APART[0]:
-            self._map_T_own = None
+            self._map_T_local = None
         return moved
 
     def _fits(self, moved: MapUpdate) -> bool:
         """Whether a sweep is for sure where it was found; asked only while that matters."""
         seen = self._mapper.registered
-        if self._map_T_own is None:
+        if self._map_T_local is None:
             return True
         if surely_placed(moved) is None or seen is None or seen.matches is None:
             return False
@@ -139,7 +139,7 @@ class Motion:
     @property
     def map_T_lidar(self) -> gtsam.Pose3 | None:
         """Where the motion has led in the saved map; None if that is not known."""
-        return None if self._map_T_own is None else self._map_T_own.compose(self._last)
+        return None if self._map_T_local is None else self._map_T_local.compose(self._last)
 
     def leads_to(self, pose: gtsam.Pose3) -> bool:
         """Whether the lidar may be at a pose in the saved map."""

@@ -258,17 +258,17 @@ class Localizer:
         if update.uncertainty is None or not update.status.solved:
             return update
         self._last = update
-        own = update.uncertainty.own
+        covariance = update.uncertainty.own
         self._sure = self._sure + 1 if update.status is FrameStatus.OK else 0
         if self._extend:
-            own = update.covariance  # with the drift since the fix
+            covariance = update.covariance  # with the drift since the fix
         elif self._sure >= SWEEPS or self._seen is None:
             self._seen = update
         else:  # what no scan saw since then has drifted
-            own = relative_covariance(self._seen, update)
+            covariance = relative_covariance(self._seen, update)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         of_map = from_map @ self.map_covariance(update.map_T_lidar) @ from_map.T
-        return replace(update, covariance=symmetric(own + of_map))
+        return replace(update, covariance=symmetric(covariance + of_map))
 
     def _add_places(self) -> None:
         """Take over places of new ground; the error of the map before is in theirs, too."""
@@ -322,11 +322,11 @@ def own_settings(saved: SavedMap) -> Config:
 
 def config_in(saved: SavedMap, config: Config | None, *, extend: bool = False) -> Config:
     """The configuration of a mapper in a saved map, which it may extend."""
-    config, own = saved.config if config is None else as_config(config), saved.config
-    shape = {name: getattr(own.loops, name) for name in ("rings", "sectors", "reach")}
-    window = tuple(n + 2 * _BEYOND for n in own.map.neighbourhood)
-    margin = max(own.map.neighbourhood) // 2
-    cubes = own.map.changed(window=window, window_margin=margin, archive_dir=None)
+    config = saved.config if config is None else as_config(config)
+    shape = {name: getattr(saved.config.loops, name) for name in ("rings", "sectors", "reach")}
+    window = tuple(n + 2 * _BEYOND for n in saved.config.map.neighbourhood)
+    margin = max(saved.config.map.neighbourhood) // 2
+    cubes = saved.config.map.changed(window=window, window_margin=margin, archive_dir=None)
     return config.changed(
         map=cubes,
         aiding=AidingConfig(),  # fixes tie a run, not a drive in a map that stays

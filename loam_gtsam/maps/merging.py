@@ -152,7 +152,7 @@ def merge_maps(
 
 
 def _check(maps: Sequence[SavedMap]) -> None:
-    shapes = [(own.rings, own.sectors, own.reach) for own in (m.config.loops for m in maps)]
+    shapes = [(loops.rings, loops.sectors, loops.reach) for loops in (m.config.loops for m in maps)]
     for saved, shape in zip(maps, shapes, strict=True):
         if shape != shapes[0]:
             raise DatasetError(
@@ -363,7 +363,7 @@ class _Whole:
             placed = replace(place, map_T_middle=pose, covariance=symmetric(covariance))
             places.append(placed)
         active = [report.active for report in solved.loops[: len(self._loops)]]
-        own = [loop for loop, on in zip(self._loops, active, strict=True) if on]
+        loops = [loop for loop, on in zip(self._loops, active, strict=True) if on]
         map_of = self._common.map_of
         counts: dict[Pair, int] = {}
         for tie in ties:
@@ -373,7 +373,7 @@ class _Whole:
             number: places[start].map_T_middle.compose(self._before[start].map_T_middle.inverse())
             for number, start in enumerate(self._starts)
         }
-        graph = MapGraph(places, self._links, [*own, *ties], self._fixes, self._own(frames))
+        graph = MapGraph(places, self._links, [*loops, *ties], self._fixes, self._own(frames))
         earth = None
         if self._fixes is not None:
             origin, enu_T_map = _on_earth(self._maps)[0][1].origin, solved.poses.atPose3(MAP_KEY)

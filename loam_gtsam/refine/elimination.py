@@ -265,11 +265,11 @@ def seen_directions(map_T_middle: FloatArray, landmarks: Landmarks, seen: Sighti
     parts = []
     for axis in (faces.normals, faces.turns[:, :, 0], faces.turns[:, :, 1]):
         by_pose = _by_pose(relative, axis[faces.faces])
-        own = by_pose @ moments @ np.swapaxes(by_pose, 1, 2)
+        by_sweep = by_pose @ moments @ np.swapaxes(by_pose, 1, 2)
         if axis is not faces.normals:
             known = np.einsum("ni,nij,nj->n", axis, spread, axis)
-            own *= (1.0 / np.maximum(known, 1e-12))[faces.faces, None, None]
-        parts.append(summed(own, seen.sweeps[faces.pairs], count))
+            by_sweep *= (1.0 / np.maximum(known, 1e-12))[faces.faces, None, None]
+        parts.append(summed(by_sweep, seen.sweeps[faces.pairs], count))
     whole, noise = parts[0], parts[1] + parts[2]
     values, vectors = np.linalg.eigh(whole)
     least = 1e-12 * np.maximum(values[:, -1:], 1e-12)
@@ -331,7 +331,7 @@ def eliminated(
     by_plane = np.einsum("nji,njk->nik", relative, basis[faces.faces])
     plane = np.column_stack([local, np.einsum("ni,ni->n", normals, relative[:, :3, 3])])
     weighted = by_pose @ moments
-    own = weighted @ np.swapaxes(by_pose, 1, 2)
+    by_sweep = weighted @ np.swapaxes(by_pose, 1, 2)
     across = weighted @ by_plane
     pull = np.einsum("nij,nj->ni", weighted, plane)
     on_plane = moments @ by_plane
@@ -346,7 +346,7 @@ def eliminated(
 
     pull -= np.einsum("nij,nj->ni", across, their_pull[faces.faces])
     gradient = summed(pull, sweeps, count)
-    blocks = summed(own, sweeps, count)
+    blocks = summed(by_sweep, sweeps, count)
     hessian = bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count,) * 2)
     hessian = hessian - _outer_products(across, sweeps, faces.faces, count, planes)
     return Reduced(csc_array(hessian), gradient.ravel())

@@ -426,10 +426,9 @@ def _adjusted(
     every, told = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
     keeps = [told_directions(run.updates, min_aligned) for run in runs]
     for start, run, keep in zip(starts, runs, keeps, strict=True):
-        own = run.updates, run.odometry
-        far = long_motion_factors(*own, start=start)
+        far = long_motion_factors(run.updates, run.odometry, start=start)
         for graph, chosen in ((every, None), (told, keep)):
-            graph.push_back(odometry_factors(*own, chosen, start=start))
+            graph.push_back(odometry_factors(run.updates, run.odometry, chosen, start=start))
             graph.push_back(far)
     every.push_back(further)
     told.push_back(further)

@@ -81,16 +81,16 @@ class FactorTies:
 
         An InputError if the factors leave open where that is.
         """
-        values, own = gtsam.Values(self.others), 6 * len(self.places)
+        values, size = gtsam.Values(self.others), 6 * len(self.places)
         for number, (key, place_T_middle) in self.places.items():
             values.insert(key, gtsam.Pose3(poses[number]).compose(place_T_middle.inverse()))
         for _ in range(_STEPS):
             information, pull = self.factors.linearize(values).hessian(self._order)
             if not self.others.size():
                 break
-            if not _all_told(information[own:, own:]):
+            if not _all_told(information[size:, size:]):
                 raise InputError(f"refine: {self.unknown}")
-            step = np.asarray(np.linalg.solve(information[own:, own:], pull[own:]), float)
+            step = np.asarray(np.linalg.solve(information[size:, size:], pull[size:]), float)
             if np.abs(step).max() < _ENOUGH:
                 break
             moved = gtsam.VectorValues()
@@ -107,13 +107,13 @@ class FactorTies:
         """Information (6 K, 6 K) and gradient (6 K,) at poses (N, 4, 4) of all sweeps."""
         _, information, pull = self.fitted(poses)
         count, turn = len(self.places), self._to_places
-        own = 6 * count
-        across = information[:own, own:]
-        by_pose = np.linalg.solve(information[own:, own:], across.T)
-        of_places = (information[:own, :own] - across @ by_pose).reshape(count, 6, count, 6)
+        size = 6 * count
+        across = information[:size, size:]
+        by_pose = np.linalg.solve(information[size:, size:], across.T)
+        of_places = (information[:size, :size] - across @ by_pose).reshape(count, 6, count, 6)
         of_middles = np.einsum("nji,njmk,mkl->niml", turn, of_places, turn, optimize=True)
-        pull = np.einsum("nji,nj->ni", turn, (pull[:own] - by_pose.T @ pull[own:]).reshape(-1, 6))
-        return of_middles.reshape(own, own), -pull.ravel()
+        pull = np.einsum("nji,nj->ni", turn, (pull[:size] - by_pose.T @ pull[size:]).reshape(-1, 6))
+        return of_middles.reshape(size, size), -pull.ravel()
 
 
 def own_ties(
@@ -237,9 +237,9 @@ class FixTies:
         If the fixes are farther off than their covariances say, its covariance is larger for it.
         """
         values, information, _ = self._ties.fitted(poses)
-        own = 6 * len(self.numbers)
-        known, of_map = np.linalg.inv(information[own:, own:]), self._ties.rows[MAP_KEY]
-        by_pose = known[of_map] @ information[own:, :own]
+        size = 6 * len(self.numbers)
+        known, of_map = np.linalg.inv(information[size:, size:]), self._ties.rows[MAP_KEY]
+        by_pose = known[of_map] @ information[size:, :size]
         rows = (6 * self.numbers[:, None] + np.arange(6)).ravel()
         units = np.zeros((6 * len(poses), 6))
         units[rows] = by_pose.T

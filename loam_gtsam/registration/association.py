@@ -113,17 +113,17 @@ def match_features(
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
             ways = (in_map, True, config.wide_search * limit), (match_uprights, poles, limit)
-            own = None
+            reaches = None
             if expected and rows.alone is not None:
-                own = _own_reaches(edges, rows.alone, config)
+                reaches = _half_ways(edges, rows.alone, config)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
                 if not len(chosen):
                     continue
                 here = edges_map[chosen]
                 near, squared, _ = edge_map.nearest(here, k, far, around)
-                if own is not None:
-                    squared = _within(own[chosen], here, near, squared, pose[:3, 2])
+                if reaches is not None:
+                    squared = _within(reaches[chosen], here, near, squared, pose[:3, 2])
                 more = match(edges[chosen], here, near, squared, pose, config, far)
                 lines = joined(lines, replace(more, indices=chosen[more.indices]))
                 left[lines.indices] = False
@@ -140,7 +140,7 @@ def match_features(
     )
 
 
-def _own_reaches(points: FloatArray, uprights: BoolArray, config: MatchingConfig) -> FloatArray:
+def _half_ways(points: FloatArray, uprights: BoolArray, config: MatchingConfig) -> FloatArray:
     """Metres (N,) across the axis of the rings, half way from each upright to the nearest other.
 
     What is farther from where one is expected may as well be that other one: among clouds of dust,

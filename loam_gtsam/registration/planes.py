@@ -91,14 +91,14 @@ def match_surfaces(
     sight /= np.maximum(norm(sight), _TINY)
     side = dot(fits.normals, sight)
     least = _least_sines(config.point_sigma, k, fits.eigenvalues[1])
-    views, own = near.views.take(rows, axis=0), _towards(fits.normals, sight, least)
+    views, towards = near.views.take(rows, axis=0), _towards(fits.normals, sight, least)
     normals, surely = _wide_surfaces(here, fits.normals, config)
-    facing = np.where(surely < least, _towards(normals, sight, surely), own)
+    facing = np.where(surely < least, _towards(normals, sight, surely), towards)
     least = np.minimum(surely, least)
     hidden = (sines(views, facing) < -least).any(axis=0)
     # A plane that is seen at a steeper angle now has moved more if ranges are too long.
-    seen, away = sines(views, own), map_T_lidar[:3, 3:] - fits.centres
-    turned = seen.mean(axis=0) - dot(own, away) / np.maximum(norm(away), _TINY)
+    seen, away = sines(views, towards), map_T_lidar[:3, 3:] - fits.centres
+    turned = seen.mean(axis=0) - dot(towards, away) / np.maximum(norm(away), _TINY)
     known = seen.any(axis=0) & ~hidden & (np.abs(turned) > LEAST_ANGLE)
     by_range = np.where(known, np.sign(side) * turned, 0.0)
     doubtful = np.flatnonzero(hidden & fits.planar)

@@ -308,8 +308,8 @@ def _settings(run: SolverRun) -> str:
     default = config_to_dict(Config())
     changed = []
     for section, values in config_to_dict(run.config).items():
-        own = (key for key in values if values[key] != default[section][key])
-        changed += [f"{section}.{key} = {values[key]}" for key in own]
+        differing = (key for key in values if values[key] != default[section][key])
+        changed += [f"{section}.{key} = {values[key]}" for key in differing]
     return f"{run.version}; differs from the default in: {', '.join(changed) or 'nothing'}"
 
 

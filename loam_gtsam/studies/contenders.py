@@ -296,10 +296,10 @@ class SharedGuess:
         if features is self._features and self._step is not None and last is not None:
             last_T_guess, first = self._step
             return Guess(last.map_T_lidar.compose(last_T_guess), first.twist)
-        own = self._odometry.guess(features, last)
+        guess = self._odometry.guess(features, last)
         self._features = features
-        self._step = None if last is None else (last.map_T_lidar.between(own.map_T_lidar), own)
-        return own
+        self._step = None if last is None else (last.map_T_lidar.between(guess.map_T_lidar), guess)
+        return guess
 
     def remember(self, features: Features) -> None:
         """See :meth:`loam_gtsam.registration.odometry.Odometry.remember`."""

@@ -45,7 +45,7 @@ class Archive:
         self._disk: dict[CubeIndex, tuple[int, Path]] = {}  # number of points, and the file
         self._stale: list[Path] | None = None  # to be removed, once nothing is remembered
         self._parent = None if folder is None else Path(folder).absolute()
-        self._own: Path | None = None  # in the parent, once a cube went there
+        self._subfolder: Path | None = None  # in the parent, once a cube went there
         self.dropped_cubes = self.dropped_points = 0
         if self._parent is not None:
             try:
@@ -95,7 +95,7 @@ class Archive:
             "_disk": self._disk.copy(),
             "_stale": [],  # the files are in use again
         }
-        del before["_own"]  # which stays, once it is made
+        del before["_subfolder"]  # which stays, once it is made
         return partial(vars(self).update, before)
 
     def indices(self) -> list[CubeIndex]:
@@ -193,15 +193,15 @@ class Archive:
                 np.save(file, np.column_stack(content), allow_pickle=False)
             os.replace(temporary, path)  # a file under its final name is always whole
         except OSError as error:
-            self._drop(len(points), f"cannot write to {self._own or self._parent}: {error}")
+            self._drop(len(points), f"cannot write to {self._subfolder or self._parent}: {error}")
         else:
             self._disk[index] = len(points), path
 
     def _folder(self, parent: Path) -> Path:
-        if self._own is None:
-            self._own = Path(tempfile.mkdtemp(prefix="cubes_", dir=parent))
-            weakref.finalize(self, shutil.rmtree, self._own, ignore_errors=True)
-        return self._own
+        if self._subfolder is None:
+            self._subfolder = Path(tempfile.mkdtemp(prefix="cubes_", dir=parent))
+            weakref.finalize(self, shutil.rmtree, self._subfolder, ignore_errors=True)
+        return self._subfolder
 
     def _drop(self, n_points: int, reason: str) -> None:
         """Count a loss; say it once, as a full disk would say it for every cube."""

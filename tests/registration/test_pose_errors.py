@@ -25,7 +25,7 @@ from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.registration.uncertainty import PoseErrors, relative_covariance
 from loam_gtsam.registration.uncertainty import pose_errors as covariance_module
-from loam_gtsam.registration.uncertainty.own_errors import OwnErrors, unresolved
+from loam_gtsam.registration.uncertainty.frame_errors import FrameErrors, unresolved
 from loam_gtsam.studies.evaluation import nees
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
@@ -267,7 +267,7 @@ def own_errors(
     config = Config()
     expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
     accelerations = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
-    errors = OwnErrors(config.imu.gyro_noise)
+    errors = FrameErrors(config.imu.gyro_noise)
     drawn = np.zeros((6, 6))
     drawn[4, [0, 3]] = across
     scan = ScanError(

@@ -114,10 +114,10 @@ class RosbagFiles:
             store.get_msgdef(kind)  # with all types that are in it
             if digest in ("", None, _ANY_DIGEST):
                 return store
-            own = store.hash_rihs01(kind) if self.is2 else store.generate_msgdef(kind)[1]
+            computed = store.hash_rihs01(kind) if self.is2 else store.generate_msgdef(kind)[1]
         except Exception:  # whatever its parser stumbles over
             return None
-        return store if own == digest or kind not in self._default.fielddefs else None
+        return store if computed == digest or kind not in self._default.fielddefs else None
 
 
 class _Schemas(dict[int, Any]):
@@ -186,11 +186,11 @@ class _Folder(DirectoryReader):
         same = [c.ext for c in self.connections if _is_same(c, found)]
         return found if found.ext in same or not same else found._replace(ext=same[0])
 
-    def _counted(self, own: Connection) -> Connection:
-        there = [c for storage in self.storages for c in storage.connections if _is_same(c, own)]
-        count = sum(c.msgcount for c in there if c.ext == own.ext)
-        few = isinstance(own.msgcount, int) and own.msgcount < count
-        return own._replace(msgcount=count) if few else own
+    def _counted(self, found: Connection) -> Connection:
+        there = [c for storage in self.storages for c in storage.connections if _is_same(c, found)]
+        count = sum(c.msgcount for c in there if c.ext == found.ext)
+        few = isinstance(found.msgcount, int) and found.msgcount < count
+        return found._replace(msgcount=count) if few else found
 
 
 def _is_same(one: Connection, other: Connection) -> bool:

@@ -39,15 +39,15 @@ class StampMatcher:
 
     def add(self, topic: str, stamp: int, message: Any) -> dict[str, Any] | None:
         """The group this message completes, if it does; older messages are then given up."""
-        own = self._waiting[topic]
-        if stamp in own or len(own) >= _WAITING:
-            del own[stamp if stamp in own else min(own)]
+        messages = self._waiting[topic]
+        if stamp in messages or len(messages) >= _WAITING:
+            del messages[stamp if stamp in messages else min(messages)]
             self.unmatched[topic] += 1
-        own[stamp] = message
+        messages[stamp] = message
         if not all(self._waiting.values()):
             return None
         waiting = self._waiting.items()
-        nearest = {other: min(own, key=lambda s: abs(s - stamp)) for other, own in waiting}
+        nearest = {other: min(stamps, key=lambda s: abs(s - stamp)) for other, stamps in waiting}
         if max(nearest.values()) - min(nearest.values()) > STAMP_TOLERANCE_NS:
             return None
         group = {other: self._waiting[other].pop(best) for other, best in nearest.items()}

@@ -136,8 +136,8 @@ class SimulatedWorld(Loader):
         _whole_at_least(8, **_given(columns=columns))
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         self._lidar, self._rings = sensor, sensor in SENSORS
-        _, own_columns = SENSORS[sensor] if self._rings else PATTERNS[sensor]
-        self._columns = own_columns if columns is None else columns
+        _, usual = SENSORS[sensor] if self._rings else PATTERNS[sensor]
+        self._columns = usual if columns is None else columns
         speed = self.scene.speed if speed is None else speed
         noises = {"gyro_noise": gyro_noise, "acceleration_noise": acceleration_noise}
         _at_least(0.0, range_noise=range_noise, foliage_noise=foliage_noise)
@@ -151,8 +151,8 @@ class SimulatedWorld(Loader):
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
         self._imu_kind = imu
         biases = {"gyro_bias": gyro_bias, "acceleration_bias": acceleration_bias}
-        own = {"attitude_noise": imu_noise} | noises | biases
-        self._imu_errors = ImuErrors.of(imu, seed, own)
+        given = {"attitude_noise": imu_noise} | noises | biases
+        self._imu_errors = ImuErrors.of(imu, seed, given)
         self._motion = Motion(self.scene, float(speed), start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"

@@ -383,7 +383,7 @@ def _with_motion(
         if best is None or fit.total > CLEARLY * best[0].total:
             best = fit, found, posed
     if best is None:
-        best = _by_own_motion(frame, max(tried, key=lambda one: one[0].total), monitor, solver)
+        best = _by_told_motion(frame, max(tried, key=lambda one: one[0].total), monitor, solver)
     if best is None:
         return None
     distance = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
@@ -398,7 +398,7 @@ def _tried(
     return fit_of(matcher, found), found, matcher.posed
 
 
-def _by_own_motion(
+def _by_told_motion(
     frame: Frame, closest: tuple[Fit, Solution, PosedSweep], monitor: FitMonitor, solver: ScanSolver
 ) -> tuple[Fit, Solution, PosedSweep] | None:
     """A sweep that hardly fits, de-skewed for the motion that its matches tell; None if in vain.

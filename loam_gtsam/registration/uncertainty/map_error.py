@@ -14,7 +14,7 @@ from loam_gtsam.geometry import nearest_positive, symmetric
 from loam_gtsam.registration.odometry import ANYWHERE, Moment, Turns
 from loam_gtsam.registration.solvers import MotionFilter, MotionPrior, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.registration.uncertainty.own_errors import rotation_is_known, unresolved
+from loam_gtsam.registration.uncertainty.frame_errors import rotation_is_known, unresolved
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import FloatArray
 
@@ -264,14 +264,14 @@ class _Origin:
         bend *= faster
         if rotation_is_known(first.sweep):
             by_velocity[:, :3] = bend[:, :3] = 0.0
-        own = by_velocity @ scan.covariance @ by_velocity.T / seconds**2
+        covariance = by_velocity @ scan.covariance @ by_velocity.T / seconds**2
         if velocity is not None:
             aside = by_velocity @ (velocity - first.twist)
-            own = own + np.outer(aside, aside)
-        return cls(middle.AdjointMap(), own, bend)
+            covariance = covariance + np.outer(aside, aside)
+        return cls(middle.AdjointMap(), covariance, bend)
 
     def error(self, accelerations: FloatArray) -> FloatArray:
         """(6, 6) in the map, from the (6,) mean squared accelerations."""
-        own = self.velocity + self.bend * accelerations @ self.bend.T
-        in_map: FloatArray = self.to_map @ own @ self.to_map.T
+        covariance = self.velocity + self.bend * accelerations @ self.bend.T
+        in_map: FloatArray = self.to_map @ covariance @ self.to_map.T
         return in_map

@@ -24,8 +24,8 @@ from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
+from loam_gtsam.registration.uncertainty.frame_errors import FrameErrors
 from loam_gtsam.registration.uncertainty.map_error import MapError
-from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import (
     FloatArray,
@@ -103,7 +103,7 @@ class PoseErrors:
         self._with_priors = graph
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
-        self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
+        self._map, self._frames = MapError(config), FrameErrors(config.imu.gyro_noise)
         self.beam_errors = BeamErrors(config)
         self._found: MapUpdate | None = None  # the last update of a sweep that was found
 
@@ -177,7 +177,7 @@ class PoseErrors:
         """
         self._found = update
         if scan is None:
-            self._own.cut()
+            self._frames.cut()
             return update
         middle = solution.map_T_lidar
         by_imu = fused if solution.weak is None else None
@@ -187,20 +187,20 @@ class PoseErrors:
         if fused is not None:
             self._map.set_velocity(middle.rotation().unrotate(fused.velocity))
         self._add_acceleration(sweep, middle, known, last)
-        own = self._own.of(update, sweep, middle, scan, self._motion, by_imu, turned)
+        frame = self._frames.of(update, sweep, middle, scan, self._motion, by_imu, turned)
         if self._scans == 1:
             self._map.set_origin(sweep, scan, middle, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)
         if last is not None and doubt is None:
             self.beam_errors.add(sweep, solution, scan)
         # A pose that own factors tell shares less of the map's error.
-        from_map = own.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
-        covariance = own.covariance + from_map @ self._map.doubt @ from_map.T
+        from_map = frame.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
+        covariance = frame.covariance + from_map @ self._map.doubt @ from_map.T
         blind, forgotten = self._map.blind
         uncertainty = Uncertainty(
             own=covariance,
-            shared=own.shared,
-            follows=own.follows,
+            shared=frame.shared,
+            follows=frame.follows,
             drift=self._map.drift,
             blind=blind,
             forgotten=forgotten,
@@ -216,7 +216,7 @@ class PoseErrors:
         self, sweep: MovingSweep, middle: gtsam.Pose3, known: FloatArray, last: Moment | None
     ) -> None:
         """What the pose of a sweep, of covariance ``known`` (6, 6), tells of the acceleration."""
-        before = self._own.last
+        before = self._frames.last
         if self._scans == 1 and last is not None:
             before = last.stamp, last.map_T_lidar
         # A pose in doubt tells no acceleration; that of the very first sweep does.
@@ -249,7 +249,7 @@ class PoseErrors:
                     step = min(step, steady, key=lambda way: float(np.linalg.norm(way[3:])))
             self._map.add_jump(pose, step, missed)
         elif np.array_equal(posed.twist, expected.posed.twist):
-            self._own.stray(step)
+            self._frames.stray(step)
 
     def disputed(self, pose: gtsam.Pose3, other: OtherPose | None) -> None:
         """Account for another pose to which an IMU alone leads; None if there is none."""
@@ -275,5 +275,5 @@ class PoseErrors:
 
     def cut(self, ahead: int) -> None:
         """Start anew in time: the next frame is on a clock that was set ahead, nanoseconds."""
-        self._own.cut(paused=True)
+        self._frames.cut(paused=True)
         self._map.cut(ahead)

@@ -23,7 +23,7 @@ _PAUSE = 1.0
 sweeps took that were on neither clock."""
 
 
-class OwnError(NamedTuple):
+class FrameError(NamedTuple):
     """Of a frame, at its reference time.
 
     Attributes
@@ -54,7 +54,7 @@ class _Middle:
     lasting: FloatArray | None = None  # (6, 6) root of what its scan shares with the next one's
 
 
-class OwnErrors:
+class FrameErrors:
     """Brings the errors of scans, which are at the middles of sweeps, to the reference times.
 
     ``gyro_noise`` is a density, rad/s/sqrt(Hz).
@@ -88,7 +88,7 @@ class OwnErrors:
         motion: Accelerations,
         fused: Fused | None,
         turned: FloatArray | None = None,
-    ) -> OwnError:
+    ) -> FrameError:
         """The own error of a frame, each in turn.
 
         That of its ``scan`` is at the pose of the ``middle``; ``fused`` is the pose by scan and IMU
@@ -99,16 +99,16 @@ class OwnErrors:
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
         now = _Middle(sweep.stamp, middle, scan.covariance, np.ones(6), to_reference, update.stamp)
         if fused is None:
-            now, own, shared = self._by_scan(now, sweep, motion, scan)
+            now, covariance, shared = self._by_scan(now, sweep, motion, scan)
             if self._paused:
-                own = own + _changed(update.twist, sweep, motion.variances)
+                covariance = covariance + _changed(update.twist, sweep, motion.variances)
         else:
-            now, own, shared = self._by_imu(now, sweep, motion, fused, update)
+            now, covariance, shared = self._by_imu(now, sweep, motion, fused, update)
         if turned is not None and last is not None and sweep.motion is SweepMotion.GYRO:
-            own = own + _turned_unlike(turned, sweep, scan, now, last)
+            covariance = covariance + _turned_unlike(turned, sweep, scan, now, last)
         self._last, self._paused, self._strayed = now, False, np.zeros(6)
         follows = None if last is None else last.reference_stamp
-        return OwnError(symmetric(own), to_reference, shared, follows)
+        return FrameError(symmetric(covariance), to_reference, shared, follows)
 
     def _by_scan(
         self, now: _Middle, sweep: MovingSweep, motion: Accelerations, scan: ScanError
@@ -124,16 +124,16 @@ class OwnErrors:
         if rotation_is_known(sweep):
             share[:3] = 0.0
         kept, to_reference = 1.0 - share, now.to_reference
-        own = kept[:, None] * now.covariance * kept
+        covariance = kept[:, None] * now.covariance * kept
         shared = np.zeros((6, 6))
         if last is not None:
             across = share[:, None] * now.map_T_lidar.between(last.map_T_lidar).AdjointMap()
-            own = own + across @ last.covariance @ across.T
+            covariance = covariance + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
         strayed = share * self._strayed
-        own = own + self._missed(sweep, motion, scan) + np.outer(strayed, strayed)
-        own = to_reference @ own @ to_reference.T
-        return replace(now, kept=kept), own, shared
+        covariance = covariance + self._missed(sweep, motion, scan) + np.outer(strayed, strayed)
+        covariance = to_reference @ covariance @ to_reference.T
+        return replace(now, kept=kept), covariance, shared
 
     def _by_imu(
         self,
@@ -152,16 +152,13 @@ class OwnErrors:
         of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
         turned = np.zeros((6, 6))
         turned[:3, :3] = self._missed(sweep, motion)[:3, :3]
-        own = of_state @ fused.covariance @ of_state.T + turned + lasting @ lasting.T
+        covariance = of_state @ fused.covariance @ of_state.T + turned + lasting @ lasting.T
         shared = np.zeros((6, 6))
         if last is not None and last.of_state is not None and last.lasting is not None:
             shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
-        covariance = fused.covariance[:6, :6]
-        return (
-            replace(now, covariance=covariance, of_state=of_state, lasting=lasting),
-            own,
-            shared,
-        )
+        at_middle = fused.covariance[:6, :6]
+        now = replace(now, covariance=at_middle, of_state=of_state, lasting=lasting)
+        return now, covariance, shared
 
     def _missed(
         self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None

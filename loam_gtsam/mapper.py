@@ -106,13 +106,9 @@ class Mapper:
     """
 
     def __init__(
-        self,
-        config: Config | None = None,
-        solver: ScanSolver | None = None,
-        *,
-        imu: ImuBuffer | None = None,
-        extra_factors: ExtraFactors | None = None,
-    ) -> None:
+        self, config: Config | None = None, solver: ScanSolver | None = None, *,
+        imu: ImuBuffer | None = None, extra_factors: ExtraFactors | None = None,
+    ) -> None:  # fmt: skip
         self.config = _with_settings_of(solver, as_config(config))
         self.solver = make_solver(self.config.solver) if solver is None else solver
         imu = None if self.config.imu.coupling == "off" else imu
@@ -176,9 +172,9 @@ class Mapper:
         if self.last is None and self.imu is not None:
             guess = self.imu.first_pose(features.stamp, guess)
         sweep = MovingSweep(features, self.config, self.imu.trusted_gyro if self.imu else None)
-        before = self.last, self._moment, self.imu
-        expected = self.errors.expected(sweep.stamp, *before[1:]) if guess is None else None
-        predicted = predict(sweep, *before, self.config.solver, guess, twist, expected)
+        last, imu = self._moment, self.imu
+        expected = self.errors.expected(sweep.stamp, last, imu) if guess is None else None
+        predicted = predict(sweep, self.last, last, imu, self.config.solver, guess, twist, expected)
         try:
             self.maps.recenter(predicted.map_T_middle, features.reach)
         except InputError as error:
@@ -268,13 +264,14 @@ class Mapper:
         self, predicted: Prediction, priors: Sequence[gtsam.NonlinearFactor], clock: Clock
     ) -> Frame:
         """What the solve starts from: matches, the caller's factors, the IMU's and the user's."""
-        stamp, known = predicted.posed.sweep.stamp, (self._moment, self.config.solver)
-        predicted, own = _beside_own(predicted, priors, self.extra_factors, *known)
+        stamp, last = predicted.posed.sweep.stamp, self._moment
+        predicted, own = _beside_own(
+            predicted, priors, self.extra_factors, last, self.config.solver
+        )
         factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
-        args = predicted.posed, self.maps, self.maps.config, self._moment, clock
         matcher = FrameMatcher.of(
-            *args, expected=self.start is None, inertial=predicted.inertial,
-            accelerations=self.errors.accelerations,
+            predicted.posed, self.maps, self.maps.config, last, clock, expected=self.start is None,
+            inertial=predicted.inertial, accelerations=self.errors.accelerations,
         )  # fmt: skip
         return Frame(matcher, predicted, factors, own.since_last)
 
@@ -283,24 +280,27 @@ class Mapper:
         if self.start is not None:
             frame, found = self.start.add(frame, found, self.maps.keyframe, self._named, self.imu)
             self.start = None if self.start.complete else self.start
-        solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
+        solution, posed, last = found.solution, found.posed, frame.matcher.last
         accept(frame, found, self.monitor)
         between = self._named.told(frame.since_last, solution.map_T_lidar)
         scan = self.errors.of_scan(solution, posed.sweep, between, small=self.maps.small)
-        told = self.imu, posed, frame.matcher.last, solution, scan, frame.priors, found.beside_imu
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused, unlike, said, more, other = with_imu(*told)
+            posed, solution, pose, tilt, fused, unlike, said, more, other = with_imu(
+                self.imu, posed, last, solution, scan, frame.priors, found.beside_imu
+            )
         if found.message or found.in_vain or unlike:
-            step = frame.predicted, posed, solution.map_T_lidar
-            self.errors.jumped(*step, unlike=unlike, searched=found.searched)
+            self.errors.jumped(
+                frame.predicted, posed, solution.map_T_lidar, unlike=unlike, searched=found.searched
+            )
         self.errors.disputed(solution.map_T_lidar, other)
         if self.start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.saying(self.point_times.problem or said))
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
-        last = None if found.message else frame.matcher.last
-        of_sweep = posed.sweep, solution, scan, last, fused, *rivals, more
-        update = self.errors.calibrated(update, *of_sweep)
+        last = None if found.message else last
+        update = self.errors.calibrated(
+            update, posed.sweep, solution, scan, last, fused, found.doubt, found.parting, more
+        )
         clock.lap("covariance")
         self._next = None
         return update

@@ -70,8 +70,8 @@ def associate(
     if distinct is not None:
         check_array(distinct, "distinct", (len(edges),), "flags")
     rows = chosen_rows(len(edges), len(planes), config, distinct)
-    chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
-    return match_features(*chosen, map_T_lidar, edge_map, plane_map, config, rows)
+    edges, planes = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
+    return match_features(edges, planes, map_T_lidar, edge_map, plane_map, config, rows)
 
 
 def match_features(
@@ -231,10 +231,10 @@ def match_lines(
     weights = _line_weights(distances, config)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
-    fit = eigenvalues[1], eigenvalues[2], leverage
-    sigmas, tilts = deviations(*fit, 2, neighbours.shape[1], config)
-    columns = centres.T, directions.T, distances, sigmas, weights, near, tilts
-    matches = EdgeMatches(points.take(near, axis=0), *columns)
+    count = neighbours.shape[1]
+    sigmas, tilts = deviations(eigenvalues[1], eigenvalues[2], leverage, 2, count, config)
+    points = points.take(near, axis=0)
+    matches = EdgeMatches(points, centres.T, directions.T, distances, sigmas, weights, near, tilts)
     return subset(matches, is_line & (weights > config.min_weight))
 
 
@@ -265,9 +265,9 @@ def match_uprights(
     distances = np.linalg.norm(away - (away @ up)[:, None] * up, axis=1)
     weights = _line_weights(distances, config)
     sigmas = 0.5 * reach * np.sqrt(1.0 + 1.0 / count)
-    lines = centres, np.broadcast_to(up, centres.shape), distances, sigmas, weights
-    tilts = np.full(len(rows), _LEAN)
-    matches = EdgeMatches(points.take(rows, axis=0), *lines, rows, tilts)
+    points, tilts = points.take(rows, axis=0), np.full(len(rows), _LEAN)
+    ups = np.broadcast_to(up, centres.shape)
+    matches = EdgeMatches(points, centres, ups, distances, sigmas, weights, rows, tilts)
     return subset(matches, weights > config.min_weight)
 
 

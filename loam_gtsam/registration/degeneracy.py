@@ -195,9 +195,10 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     told = (np.where(sight > 0.0, 0.0, squared) * moved).T @ weights**2
     of_noise = moved.T @ (weights * tilts) ** 2 + floor
     tilt = float(np.sqrt(np.mean(tilts**2))) if len(tilts) else 0.0
-    shown = directions[order], aligned[order], along[order]
-    over_noise = (told / of_noise)[order]
-    return Localizability(*shown, unit, by_planes[order], tilt, over_noise)
+    return Localizability(
+        directions[order], aligned[order], along[order],
+        unit, by_planes[order], tilt, (told / of_noise)[order],
+    )  # fmt: skip
 
 
 def tells_motion(seen: Localizability, config: SolverConfig) -> bool:

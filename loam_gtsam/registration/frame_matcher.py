@@ -355,9 +355,8 @@ class FrameMatcher(Matcher):
 
     def twist_to(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6,) mean body velocity that leads to a pose."""
-        posed = self.posed
-        known = self.last, self.inertial, map_T_lidar, posed.twist
-        return twist_to(posed.sweep, *known, self.config.features.range_noise)
+        posed, noise = self.posed, self.config.features.range_noise
+        return twist_to(posed.sweep, self.last, self.inertial, map_T_lidar, posed.twist, noise)
 
     def _tells(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> bool:
         """Whether the matches tell the motion within the sweep."""
@@ -385,9 +384,10 @@ class FrameMatcher(Matcher):
         most = np.repeat([config.solver.turn_sigma, config.solver.acceleration_sigma], 3)
         unexpected = np.minimum(np.sqrt(self.accelerations.variances), most)
         missed = 0.5 * self.last.seconds_to(sweep.stamp) * unexpected
-        velocities = matches.search.posed.twist, expected, missed
-        noise = config.features.range_noise
-        return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
+        twist, noise = matches.search.posed.twist, config.features.range_noise
+        return solved_twist(
+            rows, matches.tilts, seconds, map_T_lidar, twist, expected, missed, noise
+        )
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
         """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""
@@ -404,8 +404,8 @@ class FrameMatcher(Matcher):
             return search
         e, p = search.found.edges, search.found.planes
         edges, planes = self.posed.rows(e.indices, p.indices)
-        moved = replace(e, points=edges), replace(p, points=planes)
-        found = ScanMatches(*moved, faces=search.found.faces)
+        e, p = replace(e, points=edges), replace(p, points=planes)
+        found = ScanMatches(e, p, faces=search.found.faces)
         return replace(search, posed=self.posed, found=found)
 
     def _search(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:

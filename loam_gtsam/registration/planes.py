@@ -261,8 +261,9 @@ def _matched_planes(
     aside = np.maximum(dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
-    fit = eigenvalues[0], eigenvalues[1], leverage
-    sigmas, tilts = deviations(*fit, 3, config.neighbours, config)
+    sigmas, tilts = deviations(
+        eigenvalues[0], eigenvalues[1], leverage, 3, config.neighbours, config
+    )
     if config.fit_uncertainty:
         sigmas = np.hypot(sigmas, _misfit(fits, config.point_sigma))
     return PlaneMatches(

@@ -142,8 +142,10 @@ def second_opinion(
     """
     m = frame.matcher
     alone = predict(MovingSweep(features, config), last, m.last, None, config.solver)
-    parts = alone.posed, m.maps, m.config, m.last, m.clock
-    matcher = FrameMatcher.of(*parts, refine=m.refine, accelerations=m.accelerations)
+    matcher = FrameMatcher.of(
+        alone.posed, m.maps, m.config, m.last, m.clock,
+        refine=m.refine, accelerations=m.accelerations,
+    )  # fmt: skip
     other = replace(frame, matcher=matcher, predicted=alone)
     solution = other.solve(solver)
     if not solution.solved:
@@ -176,8 +178,8 @@ def placed(
     if first_motion is not None:
         found = first_motion(frame, found, solver, imu)
     doubt = doubtful(frame, found.solution, monitor, last.twist)
-    now = frame.matcher.last, found.solution, frame.sweep.stamp
-    if imu is not None and (doubt is not None or imu.contradicted(*now)):
+    before, stamp = frame.matcher.last, frame.sweep.stamp
+    if imu is not None and (doubt is not None or imu.contradicted(before, found.solution, stamp)):
         frame, found = second_opinion(frame, found, *apart)
         doubt = doubtful(frame, found.solution, monitor, last.twist)
     if imu is not None and frame is not given:
@@ -414,9 +416,10 @@ def _by_told_motion(
         if not (near.solved and monitor.might_agree(fit)):
             return None
         rows, seconds = timed_rows(near.matches, sweep, config.solver)
-        motions = posed.twist, posed.twist, np.full(6, _ANY)
-        pose = near.map_T_lidar
-        twist = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
+        pose, twist = near.map_T_lidar, posed.twist
+        twist = solved_twist(
+            rows, near.matches.tilts, seconds, pose, twist, twist, np.full(6, _ANY), noise
+        )
         fit, near, posed = _tried(frame, matcher.moving_at(twist), pose, solver)
         if near.solved and monitor.fits_again(fit) and not monitor.unusual(fit):
             return fit, near, posed

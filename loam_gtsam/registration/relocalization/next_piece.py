@@ -185,7 +185,7 @@ class NextPiece:
 def _another(beside: Mapper, uncertain: FloatArray) -> Mapper:
     """A mapper like another one, of a map that is so uncertain, (6, 6) on the left, in map axes."""
     imu = None if beside.imu is None else beside.imu.buffer
-    parts = beside.config, beside.solver
-    mapper = type(beside)(*parts, imu=imu, extra_factors=beside.extra_factors)
+    factors = beside.extra_factors
+    mapper = type(beside)(beside.config, beside.solver, imu=imu, extra_factors=factors)
     mapper.errors.begin_after(beside.errors, uncertain)
     return mapper

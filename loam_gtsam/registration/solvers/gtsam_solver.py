@@ -174,8 +174,10 @@ class GtsamSolver:
         after, steps = optimizer.error(), optimizer.iterations()
         information = graph.linearize(optimizer.values()).hessian()[0]
         small = within_tolerance(pose.localCoordinates(moved), information, config)
-        sights = sight.scan, blind, without, beacons, rows, added
-        return Solution(moved, True, small, matches, 1, steps, before, after, information, *sights)
+        return Solution(
+            moved, True, small, matches, 1, steps, before, after, information,
+            sight.scan, blind, without, beacons, rows, added,
+        )  # fmt: skip
 
 
 def _contradicted(found: Solution, doubted: Directions, expected: MotionPrior | None) -> BoolArray:

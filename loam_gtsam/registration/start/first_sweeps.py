@@ -131,8 +131,8 @@ class Start:
         self._still = imu is not None and imu.was_still
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
-        told = _told(frame, found, first, solver)
-        second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, *told)
+        told, moved = _told(frame, found, first, solver)
+        second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, told, moved)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
         within = min(FASTEST * seconds, _FARTHEST), _TURNING * seconds
@@ -198,9 +198,10 @@ class Start:
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         posed, pose = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar
-        told = _told(frame, pose, self._sweeps[-1], solver)
+        told, moved = _told(frame, pose, self._sweeps[-1], solver)
         turned = _turned(frame, self._sweeps[-1], imu) if self._heeds_gyro else None
-        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told, turned)
+        motion = frame.predicted.motion
+        new = EarlySweep(posed, pose, motion, keyframe, told, moved, turned)
         gyro = None if imu is None else imu.trusted_gyro
         if imu is not None and gyro is None:
             (new,) = without_turns([new])

@@ -293,5 +293,5 @@ def _better(tried: Way, best: Way, least: float) -> bool:
 
 
 def _favour(tried: Way, best: Way, *, moving: bool = False) -> Favour:
-    told = [one.evidence for one in tried], [one.evidence for one in best]
-    return favour(*told, moving=moving)
+    found = [one.evidence for one in tried]
+    return favour(found, [one.evidence for one in best], moving=moving)

@@ -114,8 +114,10 @@ class MapError:
             share = seen.without_noise(share, rows)
         self._by_offset = to_map @ scan.by_offset
         before = last.map_T_lidar if last is not None and self._follows(last) else None
-        found = before, solution.map_T_lidar, share, scan.raw
-        step = self._velocity.observe(sweep.stamp, *found, turned=rotation_is_known(sweep))
+        step = self._velocity.observe(
+            sweep.stamp, before, solution.map_T_lidar, share, scan.raw,
+            turned=rotation_is_known(sweep),
+        )  # fmt: skip
         by_chance = renewed + step.by_chance + scan.since_last
         if seen is not None:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance

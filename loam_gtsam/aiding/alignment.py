@@ -13,7 +13,7 @@ _DRIFT = 0.02  # of the distance from either fix of the pair, by which the way m
 _LEANING = 0.3  # rad by which the z axis of a map that is not levelled may lean
 
 
-def align(
+def align_to_fixes(
     way: FloatArray, fixes: FloatArray, sigmas: FloatArray, up: FloatArray, *, levelled: bool
 ) -> tuple[FloatArray, BoolArray] | None:
     """The pose ``enu_T_map`` (4, 4) that most fixes agree with, and (N,) which do.

@@ -14,7 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.aiding.alignment import align
+from loam_gtsam.aiding.alignment import align_to_fixes
 from loam_gtsam.aiding.fix_selection import FEWEST, LEAST, FixSelection
 from loam_gtsam.aiding.placed_fixes import (
     ANTENNA_KEY,
@@ -129,7 +129,7 @@ def tie(
         return _refused(problem)
     top = UPWARD if up is None else up
     placed = problem.placed
-    start = align(problem.way, placed.enu, placed.sigmas, top, levelled=up is not None)
+    start = align_to_fixes(problem.way, placed.enu, placed.sigmas, top, levelled=up is not None)
     if start is None:
         return _refused(
             "the way is too short for the accuracy of the fixes to tell a heading", problem

@@ -16,7 +16,7 @@ from loam_gtsam.imu.preintegration import (
     NO_STEP,
     Fused,
     InertialOdometry,
-    Prediction,
+    InertialPrediction,
     StartSigmas,
 )
 from loam_gtsam.imu.preintegration_window import GRAVITY, VELOCITY, InertialState
@@ -218,7 +218,7 @@ class TightCoupling:
         up: FloatArray = -gravity / np.linalg.norm(gravity)
         return up
 
-    def predict(self, stamp: int, buffer: ImuBuffer) -> Prediction | None:
+    def predict(self, stamp: int, buffer: ImuBuffer) -> InertialPrediction | None:
         """Pose, velocity and covariance of a moment; None if not known.
 
         It is not before the first :meth:`observe`, nor if the samples have a gap or are absurd.

@@ -47,7 +47,7 @@ _SHARE = 0.25  # and by this share of the turn
 _SPEED_CHANGE = 20.0  # m/s: the mean acceleration of a recording is at most this over its length
 
 
-class Turns(NamedTuple):
+class TurnFit(NamedTuple):
     """How one set of turns, (N, 3) rad, becomes another one: ``first = factor R second + bias``.
 
     Attributes
@@ -68,7 +68,7 @@ class Turns(NamedTuple):
     residuals: FloatArray
 
 
-def compare_turns(first: FloatArray, second: FloatArray) -> Turns:
+def compare_turns(first: FloatArray, second: FloatArray) -> TurnFit:
     """Fit turns (N, 3) to others: Wahba's problem in closed form by SVD (Markley 1988).
 
     Reference: J. Astronautical Sciences 36, 1988.
@@ -88,7 +88,7 @@ def compare_turns(first: FloatArray, second: FloatArray) -> Turns:
     weakest = factor * (strength[1] + sign * strength[2])
     sigma = np.sqrt(variance / weakest) if weakest > 0.0 else np.inf
     like = 1.0 / np.sqrt(squares[0] * squares[1])
-    return Turns(gtsam.Rot3(R), factor, like * agree, like * other, float(sigma), residuals)
+    return TurnFit(gtsam.Rot3(R), factor, like * agree, like * other, float(sigma), residuals)
 
 
 def samples_problems(
@@ -269,7 +269,7 @@ def _gain(likeness: float, other: float, count: int) -> float:
     return 1.5 * count * float(np.log(left[1] / left[0]))
 
 
-def _unit(fit: Turns) -> float:
+def _unit(fit: TurnFit) -> float:
     """By what the second turns are to be multiplied if they are in another unit; else 1."""
     return next((unit for unit in _UNITS if 0.5 < fit.factor / unit < 2.0), 1.0)
 

@@ -62,7 +62,7 @@ class StartSigmas:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class InertialPrediction:
     """Pose of the next frame by the IMU, and (3,) m/s of the lidar, map frame.
 
     The (6, 6) covariance of the pose, ``[rotation, translation]``, right perturbation, is regular;
@@ -178,7 +178,7 @@ class InertialOdometry:
         state = InertialState(stamp, gtsam.Pose3(), still, still, bias, gravity, covariance)
         self._start_at(state, map_T_lidar, velocity, spread)
 
-    def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
+    def predict(self, stamp: int, samples: ImuSamples) -> InertialPrediction:
         """Pose at ``stamp``, nanoseconds, from the newest frame and the samples since, lidar axes.
 
         SweepError if there is no prediction: the samples do not cover the time between, are not in
@@ -187,7 +187,7 @@ class InertialOdometry:
         """
         frame = WindowFrame(self.config, self._window.newest + 1, self.state, stamp, samples)
         covariance = frame.predicted.covariance
-        prediction = Prediction(
+        prediction = InertialPrediction(
             *self._of_lidar(frame.predicted, frame.rate),
             self._to_lidar @ covariance[POSE, POSE] @ self._to_lidar.T,
             covariance[VELOCITY, POSE] @ self._to_lidar.T,

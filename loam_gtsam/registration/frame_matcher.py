@@ -14,7 +14,7 @@ from loam_gtsam.config import Config, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
-from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
+from loam_gtsam.imu.preintegration import InertialPrediction
 from loam_gtsam.registration.acceleration import Expected
 from loam_gtsam.registration.association import match_features, rematched
 from loam_gtsam.registration.degeneracy import localizability, tells_motion

@@ -16,7 +16,7 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.coupling import Dispute, GyroTrust, OtherPose, TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
-from loam_gtsam.imu.preintegration import NO_STEP, Fused, Prediction
+from loam_gtsam.imu.preintegration import NO_STEP, Fused, InertialPrediction
 from loam_gtsam.imu_prior import (
     blend,
     blend_direction,
@@ -74,7 +74,7 @@ def with_imu(
     return imu.add_scan(posed, last, solution, alone)
 
 
-class _Turns:
+class _TurnPairs:
     """How scans and gyro have turned between pairs of frames, the newest."""
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ class ImuTracker:
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
         self.gyro = GyroTrust()
-        self._turns = _Turns()
+        self._turns = _TurnPairs()
         self._coupling = TightCoupling(self.config)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -307,7 +307,7 @@ class ImuTracker:
         told = fused, contradicted, self.gyro.problem or self.dispute.problem, self._turns.more
         return Registration(posed, solution, pose, tilt, *told, self._coupling.other)
 
-    def predict(self, stamp: int) -> Prediction | None:
+    def predict(self, stamp: int) -> InertialPrediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.
 
         To be called once a frame, before :meth:`observe` of the same stamp.

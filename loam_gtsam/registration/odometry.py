@@ -21,7 +21,7 @@ from loam_gtsam.geometry import (
     parallel_sum,
     squared_norm,
 )
-from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
+from loam_gtsam.imu.preintegration import InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers import MotionPrior, match_rows

@@ -12,7 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
-from loam_gtsam.imu.preintegration import Prediction as Inertial
+from loam_gtsam.imu.preintegration import InertialPrediction
 from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.acceleration import Expected
 from loam_gtsam.registration.degeneracy import localizability
@@ -166,7 +166,7 @@ def test_a_motion_is_not_free_that_is_known_or_assumed(parts):
     second, last, maps = parts
     known = {"accelerations": expected(last, 1.0)}
     constant = CONFIG.changed("deskew.model=constant")
-    inertial = Inertial(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)), np.eye(3))
+    inertial = InertialPrediction(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)), np.eye(3))
     others = [
         matcher_of(*parts),
         matcher_of(*parts, refine=False, **known),

@@ -15,7 +15,7 @@ from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import move_points
-from loam_gtsam.imu.preintegration import Prediction as Predicted
+from loam_gtsam.imu.preintegration import InertialPrediction
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.odometry import (
     ConstantVelocity,
@@ -125,7 +125,7 @@ OTHER = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 3.0]))
 class Inertial(Gyro):
     """A gyro with an accelerometer that knows one pose."""
 
-    known = Predicted(
+    known = InertialPrediction(
         OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)), np.zeros((3, 6)), np.eye(3)
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import get_args
 
 import gtsam
 import numpy as np
@@ -41,7 +42,7 @@ from loam_gtsam.registration.solvers.base import (
 )
 from loam_gtsam.types import BoolArray, FloatArray
 
-_KERNELS = ("huber", "geman_mcclure")
+_KERNELS: tuple[str, ...] = get_args(SolverConfig.model_fields["kernel"].annotation)
 _REDESCENDING = 2.816
 """Width of a Geman-McClure kernel over the width of a Huber kernel with the same efficiency on
 normal noise: 3.787 and 1.345 at 95 %."""

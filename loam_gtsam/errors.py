@@ -96,6 +96,18 @@ def check_count(value: object, name: str, *, optional: bool = False) -> None:
         raise InputError(f"{name}: expected {wanted}, got {value!r}")
 
 
+def check_nanoseconds(value: object, name: str = "stamp") -> None:
+    """InputError for anything but a whole number."""
+    if not is_whole(value):
+        raise InputError(f"{name}: expected integer nanoseconds, got {value!r}")
+
+
+def check_number(value: object, name: str) -> None:
+    """InputError for anything but a finite number."""
+    if not (is_number(value) and math.isfinite(value)):  # type: ignore[arg-type]
+        raise InputError(f"{name}: expected a finite number, got {value!r}")
+
+
 def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
     """InputError for a part of a user's own that is a class, or lacks methods; None is no part."""
     if isinstance(part, type):

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.errors import check_kind, check_nanoseconds
 from loam_gtsam.geometry import as_array, as_vector
 from loam_gtsam.imu.at_rest import RestWindow, find_rest, rest_at_start
 from loam_gtsam.imu.attitude_filter import BLOCK, GravityFilter
@@ -32,7 +33,7 @@ from loam_gtsam.imu.quaternions import (
     rotation_steps,
     running_product,
 )
-from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_kind
+from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray
 
 REST_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its rest: one sweep."""
@@ -218,6 +219,7 @@ class ImuBuffer:
         the report stay the same. Dropped samples that come again are dropped again, unless
         ``stamp`` goes back as far, as it does after the clock was set back.
         """
+        check_nanoseconds(stamp)
         self._merge()
         store, config = self._store, self.config
         needed = MEMORY + config.still_seconds + config.average_seconds + config.max_gap
@@ -262,6 +264,7 @@ class ImuBuffer:
         Beyond the newest sample that one is held, for ``max_gap`` at most (LOAM holds it for
         ever). None before the first sample, inside a longer gap, or without any orientation.
         """
+        check_nanoseconds(stamp)
         quaternions, stamps = self._orientations(), self._store.samples.stamps
         if quaternions is None:
             return None
@@ -298,6 +301,7 @@ class ImuBuffer:
         than ``max_gap`` or the start of the data is in the way, if the end is more than ``max_gap``
         back (until then the last rate is held), or if the lidar turns by more than 3 rad.
         """
+        check_nanoseconds(stamp)
         seconds = as_array(seconds, "seconds", ("K",))
         earliest, latest = seconds.min(initial=0.0), seconds.max(initial=0.0)
         first, last = stamp + round(earliest * 1e9), stamp + round(latest * 1e9)
@@ -306,6 +310,8 @@ class ImuBuffer:
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps from the gyro; None as for :meth:`rotations_since`."""
+        check_nanoseconds(first, "first")
+        check_nanoseconds(second, "second")
         if second < first:
             backwards = self.rotation_between(second, first)
             return None if backwards is None else backwards.inverse()
@@ -323,6 +329,8 @@ class ImuBuffer:
 
         The orientation is that of :meth:`orientation`, NaN where unknown.
         """
+        check_nanoseconds(first, "first")
+        check_nanoseconds(last, "last")
         quaternions, samples = self._orientations(), self._store.samples
         part = slice(*np.searchsorted(samples.stamps, [first, last + 1]))
         orientation = None if quaternions is None else quaternions[part].copy()
@@ -334,6 +342,7 @@ class ImuBuffer:
 
         :func:`loam_gtsam.imu.at_rest.find_rest` says what rest means.
         """
+        check_nanoseconds(stamp)
         first = stamp - round(self.config.still_seconds * 1e9)
         return find_rest(self.config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
 

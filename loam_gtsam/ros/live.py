@@ -20,7 +20,7 @@ import numpy as np
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
-from loam_gtsam.errors import check_kind, own_code
+from loam_gtsam.errors import check_kind, check_nanoseconds, check_number, check_part, own_code
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.pipeline import Observer, Pipeline
@@ -102,7 +102,7 @@ class LiveMapper:
         extra_factors: ExtraFactors | None = None, loop_closer: LoopCloser | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
-        check_kind(imu, bool, "imu", "whether add_imu will be called")
+        _check_parts(imu, clouds, observe, clock)
         self._config = config = as_config(config)
         self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
         bounded = config.live.when_full != "never"
@@ -133,7 +133,7 @@ class LiveMapper:
         """
         if self._features:
             raise InputError("add_cloud: this run expects LOAM's topics, see add_features")
-        received = self._clock() if received is None else received
+        received = _moment(received, self._clock)
         with self._lock:
             self._log.received["cloud"] += 1
             self._enqueue(received, message)
@@ -145,8 +145,7 @@ class LiveMapper:
         ``received`` is in nanoseconds of the clock; None is now. Raises InputError if it is no
         Scan, or this run is one of LOAM's topics.
         """
-        if not isinstance(scan, Scan):
-            raise InputError(f"add_scan: expected a Scan, got {type(scan).__name__}")
+        check_kind(scan, Scan, "add_scan", "Scan(points, stamp) makes one")
         self.add_cloud(deepcopy(scan), received)
 
     def add_features(self, topic: str, message: Any, received: int | None = None) -> None:
@@ -154,12 +153,12 @@ class LiveMapper:
 
         Raises InputError if it is none of this run's topics.
         """
-        if topic not in self._features:
+        if not isinstance(topic, str) or topic not in self._features:
             raise InputError(
                 f"add_features: expected one of {', '.join(sorted(self._features)) or 'none'}; "
                 f"got {topic!r}"
             )
-        received = self._clock() if received is None else received
+        received = _moment(received, self._clock)
         with self._lock:
             self._log.received[topic] += 1
             try:
@@ -255,6 +254,7 @@ class LiveMapper:
 
     def wait(self, seconds: float) -> None:
         """Wait until a message comes, but not longer than this."""
+        check_number(seconds, "seconds")
         self._news.wait(seconds)
 
     def work(self, stop: threading.Event) -> None:
@@ -313,3 +313,22 @@ class LiveMapper:
         with self._lock:
             self._log.mapped(update, result.seconds)
         return result
+
+
+def _check_parts(imu: object, clouds: object, observe: object, clock: object) -> None:
+    """InputError for a part that is none; the pipeline checks the others."""
+    check_kind(imu, bool, "imu", "whether add_imu will be called")
+    if clouds is not None:
+        check_kind(clouds, CloudStream, "clouds", "CloudStream(time_field=...) makes one")
+    check_part(observe, "observe", "a function", "__call__")
+    check_part(clock, "clock", "a function", "__call__")
+    if clock is None:
+        raise InputError("clock: expected a function, got None; leave it out")
+
+
+def _moment(received: int | None, clock: Callable[[], int]) -> int:
+    """When a message was received, nanoseconds of the clock."""
+    if received is None:
+        return clock()
+    check_nanoseconds(received, "received")
+    return received

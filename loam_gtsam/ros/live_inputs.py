@@ -63,10 +63,12 @@ class SweepDecoder:
         clouds: CloudStream,
     ) -> None:
         check_kind(features, Collection, "features", "they are the topics of LOAM's front end")
+        for topic in features:
+            check_kind(topic, str, "features", "as /laser_cloud_sharp")
         missing = [topic for topic in REQUIRED if topic not in features]
         if features and missing:
             raise ConfigError(f"features: expected {', '.join(missing)} among them")
-        if axes not in ("auto", "lidar", "loam"):
+        if not isinstance(axes, str) or axes not in ("auto", "lidar", "loam"):
             raise ConfigError(f"axes: expected one of auto, lidar, loam; got {axes!r}")
         self._config, self._clouds = config, clouds
         self._features = FeatureDecoder(axes) if axes != "auto" else None

@@ -4,6 +4,7 @@ The call works as it is; with one argument replaced it works too, or raises an e
 which says what was expected. Nothing else leaves it.
 """
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import numpy as np
 import pytest
 
 import loam_gtsam as api
+from loam_gtsam.datasets.sim import disturbances
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.frame_table import to_dataframe
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_npz
@@ -21,6 +24,7 @@ from loam_gtsam.maps.cleaning import clean_map
 from loam_gtsam.maps.localizer import localise
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.refine.runs import refine_run, run_points
+from loam_gtsam.ros.live import LiveMapper
 from loam_gtsam.studies.evaluation import matched_truth, nees, relative_error
 
 WORLD = api.SimulatedWorld("room", frames=5, columns=400)
@@ -39,6 +43,9 @@ MATCHES = api.associate(
     CONFIG.matching,
 )
 GRAPH = api.PoseGraph()
+BUFFER, FIRST = ImuBuffer(CONFIG.imu, WORLD.imu), int(WORLD.imu.stamps[0])
+OUTLIERS, BOXES = disturbances.Outliers(), disturbances.MovingObjects()
+LIVE = LiveMapper(CONFIG, imu=True)
 SIGMA = gtsam.noiseModel.Isotropic.Sigma
 WRONG: tuple[Any, ...] = (
     None, "abc", 7, -1.5, float("nan"), object(), [1, 2], {"a": 1}, np.zeros((2, 2)),
@@ -52,6 +59,40 @@ def row(_: gtsam.Values) -> tuple[np.ndarray, list[np.ndarray]]:
 
 def register(**given: Any) -> api.MapUpdate:
     return api.Mapper().register(**given)
+
+
+def skipped(**given: Any) -> list[Any]:
+    return list(disturbances.SkippedAhead(**given))
+
+
+def kidnapped(**given: Any) -> api.Scan:
+    return disturbances.Kidnapped(**given)[3]
+
+
+def disturbed(**given: Any) -> list[Any]:
+    return list(disturbances.Disturbed(**given))
+
+
+def outliers(**given: Any) -> api.Scan:
+    return disturbances.Outliers(**given).apply(0, SWEEP)
+
+
+def dropouts(**given: Any) -> api.Scan:
+    return disturbances.SectorDropouts(**given).apply(0, SWEEP)
+
+
+def missing(**given: Any) -> bool:
+    return disturbances.MissingSweeps(**given).keeps(2)
+
+
+def boxes(**given: Any) -> api.Scan:
+    return disturbances.MovingObjects(**given).apply(0, SWEEP)
+
+
+def live(**given: Any) -> Any:
+    mapper = LiveMapper(CONFIG, **given)
+    mapper.add_scan(SWEEP)
+    return mapper.finish()
 
 
 def process(sweep: api.Scan) -> api.MapUpdate:
@@ -96,6 +137,31 @@ CALLS: dict[str, tuple[Callable[..., object], dict[str, Any]]] = {
         (api.relative_covariance, {"earlier": UPDATES[2], "later": UPDATES[3]}),
         (to_dataframe, {"updates": UPDATES}),
         (run_points, {"dataset": WORLD, "updates": UPDATES, "config": CONFIG}),
+        (ImuBuffer, {"config": CONFIG.imu, "samples": WORLD.imu}),
+        (BUFFER.orientation, {"stamp": FIRST}),
+        (BUFFER.rotations_since, {"stamp": FIRST, "seconds": np.zeros(2)}),
+        (BUFFER.rotation_between, {"first": FIRST, "second": FIRST + 10**7}),
+        (BUFFER.samples_between, {"first": FIRST, "last": FIRST + 10**7}),
+        (BUFFER.rest_at, {"stamp": FIRST}),
+        (BUFFER.forget_old, {"stamp": FIRST}),
+        (outliers, {"share": 0.2, "ranges": (1.0, 50.0), "seed": 0}),
+        (dropouts, {"share": 0.2, "sectors": 2, "seconds": 0.5, "seed": 0}),
+        (missing, {"at": (2,), "count": 1}),
+        (boxes, {"length": 8.0, "width": 2.0, "height": 3.0, "spacing": 16.0, "lane": 2.5,
+                 "bottom": -1.5, "speeds": (4.0, -9.0), "range_noise": 0.02, "seed": 0}),
+        (BOXES.hits, {"scan": SWEEP}),
+        (BOXES.covering, {"share": 0.01, "scan": SWEEP}),
+        (OUTLIERS.apply, {"number": 0, "scan": SWEEP}),
+        (disturbed, {"dataset": WORLD, "disturbances": [OUTLIERS]}),
+        (skipped, {"dataset": WORLD, "first": 1, "count": 1}),
+        (kidnapped, {"world": WORLD, "number": 2, "move": (1.0, 0.0, 0.0), "turn_deg": 5.0}),
+        (live, {"imu": False, "features": (), "axes": "auto", "clouds": None, "observe": None,
+                "solver": None, "odometry": None, "extra_factors": None, "loop_closer": None,
+                "clock": time.monotonic_ns}),
+        (LIVE.add_scan, {"scan": SWEEP, "received": None}),
+        (LIVE.add_cloud, {"message": SWEEP, "received": None}),
+        (LIVE.add_imu, {"message": WORLD.imu}),
+        (LIVE.wait, {"seconds": 0.0}),
         (refine_run, {"points": run_points(WORLD, UPDATES, CONFIG), "updates": UPDATES,
                       "trajectory": None, "graph": None, "factors": None}),
     )

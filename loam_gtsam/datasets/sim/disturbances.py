@@ -8,16 +8,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import islice
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.base import ChangedDataset, Dataset, DatasetInfo
+from loam_gtsam.datasets.base import ChangedDataset, Dataset, DatasetInfo, check_dataset
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.errors import (
+    are_two_numbers,
+    as_one_array,
+    check_all,
+    check_array,
+    check_count,
+    check_kind,
+    check_number,
+    is_number,
+)
+from loam_gtsam.geometry import as_vector
 from loam_gtsam.types import (
     BadSweep,
     BoolArray,
@@ -64,9 +75,12 @@ class Outliers(Disturbance):
 
     def __post_init__(self) -> None:
         _check_share(self.share)
+        check_count(self.seed, "seed")
+        _check_pair(self.ranges, "ranges")
 
     def apply(self, number: int, scan: Scan) -> Scan:
         """See :meth:`Disturbance.apply`."""
+        _check_sweep(number, scan)
         rng = np.random.default_rng([self.seed, number])
         chosen = rng.permutation(len(scan.points))[: round(self.share * len(scan.points))]
         return _at_ranges(scan, chosen, rng.uniform(*self.ranges, len(chosen)))
@@ -90,6 +104,9 @@ class SectorDropouts(Disturbance):
 
     def __post_init__(self) -> None:
         _check_share(self.share)
+        check_count(self.seed, "seed")
+        check_count(self.sectors, "sectors")
+        check_number(self.seconds, "seconds")
         if self.sectors < 1 or not self.seconds > 0.0:
             wanted = "at least one sector and a time above 0 s"
             got = f"{self.sectors} and {self.seconds!r}"
@@ -97,6 +114,7 @@ class SectorDropouts(Disturbance):
 
     def apply(self, number: int, scan: Scan) -> Scan:
         """See :meth:`Disturbance.apply`."""
+        _check_sweep(number, scan)
         period = int(scan.stamp) // max(round(self.seconds * 1e9), 1)
         offset = np.random.default_rng([self.seed, period]).random()
         turn = np.arctan2(scan.points[:, 1], scan.points[:, 0]) / (2.0 * np.pi)
@@ -118,6 +136,12 @@ class MissingSweeps(Disturbance):
 
     at: tuple[int, ...]
     count: int = 1
+
+    def __post_init__(self) -> None:
+        at = as_one_array(self.at, "at")
+        if at.size:
+            check_array(at, "at", ("N",), "integer numbers of sweeps")
+        check_count(self.count, "count")
 
     def keeps(self, number: int) -> bool:
         """See :meth:`Disturbance.keeps`."""
@@ -152,6 +176,11 @@ class MovingObjects(Disturbance):
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_count(self.seed, "seed")
+        _check_pair(self.speeds, "speeds")
+        for item in fields(self):
+            if item.name not in ("seed", "speeds"):
+                check_number(getattr(self, item.name), item.name)
         if not 0.0 < self.length <= self.spacing or min(self.width, self.height, self.lane) <= 0.0:
             raise ConfigError(
                 "MovingObjects: expected sizes and a lane above 0 m, and boxes no longer than "
@@ -161,6 +190,7 @@ class MovingObjects(Disturbance):
     def covering(self, share: float, scan: Scan) -> MovingObjects:
         """So long that they hide a share of a sweep's points; ConfigError if they never can."""
         _check_share(share)
+        _check_sweep(0, scan)
         # Once past the slower column: the other one is then seen at as many places.
         period = self.spacing / min((abs(v) for v in self.speeds if v), default=self.spacing)
         moments = np.arange(_CALIBRATIONS) * (period / _CALIBRATIONS)
@@ -182,10 +212,12 @@ class MovingObjects(Disturbance):
 
     def hits(self, scan: Scan) -> BoolArray:
         """(N,) which points of a sweep lie on a box instead."""
+        _check_sweep(0, scan)
         return np.asarray(np.isfinite(self._ranges(scan)))
 
     def apply(self, number: int, scan: Scan) -> Scan:
         """See :meth:`Disturbance.apply`."""
+        _check_sweep(number, scan)
         ranges = self._ranges(scan)
         hit = np.isfinite(ranges)
         rng = np.random.default_rng([self.seed, number])
@@ -233,6 +265,8 @@ class Disturbed(ChangedDataset):
     """
 
     def __init__(self, dataset: Dataset, disturbances: Sequence[Disturbance]) -> None:
+        check_dataset(dataset)
+        check_all(disturbances, Disturbance, "disturbances", "as [Outliers(0.2)]")
         super().__init__(dataset, "disturbed")
         self._disturbances = tuple(disturbances)
 
@@ -269,6 +303,9 @@ class SkippedAhead(ChangedDataset):
     """
 
     def __init__(self, dataset: Dataset, first: int, count: int) -> None:
+        check_dataset(dataset)
+        check_count(first, "first")
+        check_count(count, "count")
         if not (first > 0 and count > 0 and first + count < len(dataset)):
             within = f"within 1 to {len(dataset) - 2} to cut out"
             raise InputError(f"SkippedAhead: expected sweeps {within}, got {count} from {first}")
@@ -336,12 +373,15 @@ class Kidnapped(ChangedDataset):
         move: tuple[float, float, float] = (1.0, 0.0, 0.0),
         turn_deg: float = 0.0,
     ) -> None:
+        check_kind(world, SimulatedWorld, "world", 'as SimulatedWorld("rooms")')
+        check_count(number, "number")
+        check_number(turn_deg, "turn_deg")
         if not 0 < number < len(world):
             raise InputError(f"Kidnapped: expected a sweep in 1 to {len(world) - 1}, got {number}")
         super().__init__(world, "kidnapped")
         self._world, self._number = world, number
         turn = Rotation.from_euler("z", turn_deg, degrees=True)
-        self._moved = world.seen_from(rigid_transform(turn, move))
+        self._moved = world.seen_from(rigid_transform(turn, as_vector(move, "move")))
         self._change = f"at sweep {number} by {move} m and {turn_deg:g} degrees"
 
     def __len__(self) -> int:
@@ -390,5 +430,15 @@ def _raw(sweep: Sweep, who: str) -> Scan | BadSweep:
 
 
 def _check_share(share: float) -> None:
-    if not 0.0 <= share <= 1.0:
+    if not (is_number(share) and 0.0 <= share <= 1.0):
         raise ConfigError(f"share: expected 0 to 1, got {share!r}")
+
+
+def _check_pair(value: object, name: str) -> None:
+    if not (are_two_numbers(value) and np.isfinite(np.asarray(value)).all()):
+        raise InputError(f"{name}: expected two finite numbers, got {value!r}")
+
+
+def _check_sweep(number: int, scan: Scan) -> None:
+    check_count(number, "number")
+    check_kind(scan, Scan, "scan", "a data set of raw sweeps has them")

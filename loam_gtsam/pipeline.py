@@ -65,10 +65,10 @@ class RunResult:
     interrupted : the run was stopped (Ctrl-C) before the data set ended
     error : what ended the run early, if it was to be kept (``keep_partial``)
     imu : what was made of the IMU; None without one
-    loops : keyframes and loops; None if none were looked for. ``updates`` are then in ``odom``,
-        ``trajectory`` and the map are corrected
-    pipeline : as it is after the last sweep, for :func:`loam_gtsam.maps.map_file.save_map`
-    fixes : what became of those of a GNSS receiver; None without ``aiding.gnss``
+    loops : keyframes and loops; None if none were looked for. With loops, ``trajectory`` and the
+        map are corrected, and ``updates`` stay in the drifting frame ``odom``
+    pipeline : the pipeline after the last sweep, for :func:`loam_gtsam.maps.map_file.save_map`
+    fixes : what became of the fixes of a GNSS receiver; None without ``aiding.gnss``
     """
 
     config: Config
@@ -96,13 +96,13 @@ class RunResult:
 
     @property
     def odometry(self) -> Trajectory:
-        """One pose per sweep with a valid stamp, as it was found then."""
+        """One pose per sweep with a valid stamp, as the mapper found it, without loops."""
         good = [u for u in self.updates if u.status.has_pose]
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
     @property
     def times_problem(self) -> str:
-        """What is wrong with the times of the points, by how these move; empty if nothing is."""
+        """What is wrong with the times of the points, told by how they move; empty if nothing."""
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
 
     @property
@@ -164,7 +164,7 @@ class Pipeline:
     Parameters
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
-    wheels : predict the sweeps, if ``aiding.wheels``
+    wheels : wheel odometry, which predicts the sweeps if ``aiding.wheels`` is set
     parts : as of :func:`run`
 
     Attributes
@@ -173,7 +173,7 @@ class Pipeline:
     odometry : predicts them; None leaves it to the mapper (constant velocity, IMU)
     faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
-    places : where the map can be recognised, once it is saved; keyframes are, if there are any
+    places : where a later drive can recognise the saved map; with ``loops`` its keyframes do that
     fixes : what became of the fixes of a GNSS receiver; None if they were not asked for yet
     """
 
@@ -215,11 +215,11 @@ class Pipeline:
         self._last_odom, self.fixes, self._to_reference = None, None, 0
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
-        """Register one sweep; what it contains never raises, see the status of the result.
+        """Register one sweep. The status tells what is wrong with it; bad data raises nothing.
 
         Parameters
         ----------
-        extraction : of its features; made here if None
+        extraction : its features, if they were extracted before; they are extracted here if None
 
         Raises
         ------
@@ -287,7 +287,7 @@ class Pipeline:
         return self._with_loops(update, sweep.features)
 
     def _with_loops(self, update: MapUpdate, features: Features) -> MapUpdate:
-        """Show the frame to the pose graph, or to the places if there is none."""
+        """Add the frame to the pose graph or, without loops, to the places of the map."""
         if self.loops is None:
             place = self.places.add(update, self.mapper.registered)
             if place is not None:

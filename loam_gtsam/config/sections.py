@@ -44,8 +44,8 @@ class SensorConfig(Section):
 
     beams: tuple[BeamRow, ...] = parameter(())
     """Errors of single beams: of each its elevation (degrees), by how much its ranges are too long
-    (m), and its elevations and azimuths too large (degrees). They are taken from its points. A run
-    in which they show writes them to beams.yaml."""
+    (m), and its elevations and azimuths too large (degrees). The points are corrected by them. A
+    run in which they show writes them to beams.yaml."""
 
 
 class FeatureConfig(Section):
@@ -89,7 +89,8 @@ class FeatureConfig(Section):
     plane_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
     """The plane points of one ring are averaged over runs, or voxels, of this length."""
     thinning: Literal["runs", "voxels"] = parameter("runs", source="LOAM has voxels")
-    """Plane points are averaged so; where a run ends does not depend on range noise."""
+    """Plane points are averaged over runs along a ring, whose ends do not depend on range noise, or
+    over voxels."""
 
 
 class DeskewConfig(Section):

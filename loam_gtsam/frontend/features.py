@@ -2,20 +2,10 @@
 
 The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in Real-time, RSS
 2014, section V.A, and the published code's scan registration): curvature along each ring of the
-raw sweep, rejection of occluded and grazing points, and picks by sector. What differs from the
-published code:
-
-* Picks are made for all sectors at once, edges before plane points. The published code goes sector
-  by sector, so that which of two neighbours is picked can differ within half a window of a border.
-  Of two picks that would suppress each other, the one in the earlier sector stays.
-* A plane point must lie where its ring is smooth (:func:`roughness`, ``features.range_noise``). In
-  foliage five neighbours make a plane only by chance, and matches with such planes pull the pose
-  towards the pose from which the map was first seen.
-* An edge before a drop stands between its beam and the next (:func:`ends_of_surfaces`).
-* Poles, which are too thin for the curvature, are edges (:mod:`loam_gtsam.frontend.poles`).
-* Plane points are averaged over runs along a ring (:func:`averaged_along_rings`). The published
-  code averages those in a voxel, ``features.thinning: voxels``, where flat picks stand in
-  ``Features.planes`` as they were measured, before the rest; the published code has them twice.
+raw sweep, rejection of occluded and grazing points, and picks by sector. What differs, and why:
+docs/maths/features.md and docs/maths/deviations.md. With ``features.thinning: voxels`` flat picks
+stand in ``Features.planes`` as they were measured, before the rest; the published code has them
+twice.
 """
 
 from __future__ import annotations
@@ -197,6 +187,9 @@ def pick_by_sector(
     free: BoolArray,
 ) -> tuple[IntArray, IntArray]:
     """Greedy picks in every sector at once: best score first, each suppressing its neighbours.
+
+    LOAM goes sector by sector. Here, of two picks that would suppress each other, the one in the
+    earlier sector stays.
 
     Parameters
     ----------

@@ -209,8 +209,8 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
 
     ``sensor.rings`` selects the source; ``auto`` tries the ring field, the order of the points (in
     a range image, or in a file written ring after ring), and the elevations, and believes only
-    rings around which the elevation runs smoothly. If none of them has rings, there are none,
-    unless a source or a model is set: then SweepError lists what was tried.
+    rings around which the elevation runs smoothly. If none of them has rings, the sweep has none,
+    or, if a source or a model is set, SweepError lists what was tried.
     """
     if sensor.rings == "none":
         return without_rings(len(columns), "sensor.rings: none")

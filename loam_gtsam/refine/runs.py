@@ -366,7 +366,7 @@ class _Run:
 
     @property
     def found(self) -> BoolArray:
-        """(N,) which frames are where their sweeps, or the map, begin or were found."""
+        """(N,) which frames are in the map: their sweeps were found, or the map began with them."""
         return np.array([one.status.solved or one.status in _SEEN for one in self.updates])
 
     def from_places(self) -> list[gtsam.Pose3]:
@@ -395,7 +395,7 @@ def _starts(runs: Sequence[_Run]) -> list[int]:
 def _sweeps_of(
     places: Mapping[int, int], runs: Sequence[_Run], starts: Sequence[int]
 ) -> dict[int, int]:
-    """Numbers of the sweeps by those of places, whose stamps are given; of what runs have."""
+    """Numbers of the sweeps by those of ``places``, which are stamps; without places of no run."""
     first, found = _starts(runs), {}
     for place, stamp in places.items():
         number = bisect_right(starts, place) - 1

@@ -43,19 +43,18 @@ from loam_gtsam.voxels.tags import look, tags_of
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
 _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
 _OPEN = 1.5
-"""A place is small until the reach of a sweep is this much above the limit: not each door that
-opens changes the maps in use."""
-
+"""A place that is small stays so until the reach of a sweep is above the limit by this factor, so
+that not every open door changes the maps in use."""
 
 TrialPoints = tuple[SortedPoints | None, SortedPoints | None]
-"""Edges and planes of sweeps, of which each owns its points by its number."""
+"""Edge and plane points of several sweeps; the owner of a point is the number of its sweep."""
 
 
 class MapPair:
-    """The map of edges and the map of planes, and both once more with the voxels of small places.
+    """The map of edges and the map of planes, each with large voxels and once more with small ones.
 
-    All sweeps go into the maps of the open, those from small places into the small maps as well.
-    When a place becomes small, the small maps take over what was mapped of it from the open.
+    All sweeps go into the maps with large voxels, those from small places into both. Where a small
+    place begins, the maps with small voxels take over what was mapped of it before.
 
     Attributes
     ----------
@@ -86,9 +85,9 @@ class MapPair:
         self._thinned: CubeMap | None = None
 
     def begin_after(self, earlier: MapPair) -> None:
-        """Take up a run that was in an earlier piece: the next keyframe is the first of this one.
+        """Continue a run from an earlier piece of map; the next keyframe is the first of this one.
 
-        Until then its points have none of their own, and move with one that is elsewhere.
+        Until then the points of this piece belong to the last keyframe of the earlier one.
         """
         self.earlier, self._keyframe, self._owned = earlier, earlier.keyframe, False
 
@@ -145,7 +144,7 @@ class MapPair:
         keyframe: int,
         matches: ScanMatches | None = None,
     ) -> None:
-        """Add a sweep, by its last matches if there are any; its points belong to a keyframe."""
+        """Add a sweep as points of a keyframe; its last matches tell both sides of walls apart."""
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
         faces = None if matches is None else matches.faces
         kept = (self._open, self._small)[: 1 + self.small]
@@ -156,7 +155,7 @@ class MapPair:
         self._thinned = None
 
     def sorted_on_trial(self, sweeps: Sequence[tuple[PosedSweep, gtsam.Pose3]]) -> TrialPoints:
-        """Sweeps at their poses, sorted for :meth:`insert_on_trial`, in half the time of each."""
+        """Points of sweeps at their poses, sorted once for several :meth:`insert_on_trial`."""
         moved = [
             [transform(pose.matrix(), points) for points in posed.points] for posed, pose in sweeps
         ]
@@ -166,7 +165,7 @@ class MapPair:
         return _owned(self.edges, edges), _owned(self.planes, planes, viewed)
 
     def insert_on_trial(self, points: TrialPoints, without: int | None = None) -> None:
-        """Add sweeps, without one of them, as far as a solve reads them: no maps to keep."""
+        """Add sweeps, ``without`` one of them, to maps that serve one solve and are not kept."""
         for cubes, new in zip((self.edges, self.planes), points, strict=True):
             if new is not None and without is not None:
                 new = new.without(without)
@@ -271,7 +270,7 @@ class FrameMatcher(Matcher):
     last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
     inertial: InertialPrediction | None  # from which it takes the velocity instead
     refine: bool  # whether ``deskewed`` changes anything
-    accelerations: Expected | None  # by which the velocity is not constant
+    accelerations: Expected | None  # that change the velocity; None if it is constant
     clock: Clock  # books the time of every call on the stage ``match``
     expected: bool = False  # whether poses are where the last motion leads, and not on trial
     told: bool | None = None  # whether the matches tell the motion, if it is free; None: not known
@@ -321,7 +320,7 @@ class FrameMatcher(Matcher):
 
     @property
     def motion_is_free(self) -> bool:
-        """Whether the motion within the sweep is solved for: nothing else tells it."""
+        """Whether the motion within the sweep is solved for, because no IMU tells it."""
         sweep, last = self.posed.sweep, self.last
         alone = self.inertial is None and sweep.motion is SweepMotion.CONSTANT_VELOCITY
         known = self.accelerations is not None and last is not None and sweep.stamp > last.stamp

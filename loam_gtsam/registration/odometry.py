@@ -258,10 +258,10 @@ def twist_to(
 ) -> FloatArray:
     """(6,) body velocity that belongs to a pose at the middle of a sweep.
 
-    It is that between the middles of the last sweep and of this sweep; ``otherwise`` without a last
-    sweep, or if its middle is not earlier (sweeps of unlike length). With the IMU's prediction the
-    velocity is that which is expected if this is the pose, or predicted where its error moves no
-    point by more than a quarter of ``range_noise``, metres: that of the mean of 16 points.
+    It is the mean one between the middles of the last sweep and of this one; ``otherwise`` without
+    a last sweep, or if its middle is not earlier (sweeps of unlike length). The translation is that
+    of the IMU's prediction, if there is one, and if its error moves no point by more than a quarter
+    of ``range_noise``, metres; if it may, its expectation given that this is the pose.
     """
     twist = otherwise
     if last is not None and sweep.stamp > last.stamp:
@@ -287,10 +287,10 @@ def solved_twist(
 ) -> FloatArray:
     """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
 
-    A point measured s seconds from the middle moves with the velocity s times as far as with the
-    pose. What a change of the pose explains as well does not count, nor what the noise of the
-    normals makes of it; and the matches are not believed beyond the error of one side of the
-    sensor, which looks like a motion. See docs/maths/deskew.md.
+    A change of the velocity moves a point that was measured s seconds from the middle s times as
+    far as the same change of the pose. What a change of the pose explains as well is left out, and
+    so is the information that the noise of the normals makes. Ranges that are wrong on one side of
+    the sensor look like a motion, which limits the rest. See docs/maths/deskew.md.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def solved_twist(
 
 
 def unseen_velocity(seconds: FloatArray, range_noise: float) -> float:
-    """m/s of a motion within a sweep that the error of one side of the sensor looks like.
+    """Velocity within a sweep, m/s, that a range error of one side of the sensor looks like.
 
     ``seconds`` (R,) of the points are from the middle of the sweep; ``range_noise`` is in metres.
     """

@@ -40,12 +40,12 @@ from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, Sweep
 
 _CLOSER = 3  # largest number of places that are looked at closer
 _BASIN = 0.5
-"""Part of the reach of a match, from within which a solve converges: as the spacing of trials."""
-_TOLD = 3  # times that a sweep which fits with no expected motion tells one by itself
+"""Share of the reach of a match from within which a solve converges: trials are as far apart."""
+_TOLD = 3  # times that a sweep which fits with no expected motion is asked for its motion
 _ANY = 1e3  # rad/s and m/s: standard deviation of a motion of which nothing is known
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 _CONTRARY = "fits better as if no IMU had been there: one of the two is wrong"
-CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
+CLEARLY = 1.02  # factor by which another motion within a sweep must fit better than the first
 
 
 class Doubt(Enum):
@@ -64,10 +64,10 @@ class Found:
     posed: PosedSweep  # the sweep, de-skewed with the motion that belongs to it
     message: str = ""  # sentence for the user if the search moved the sweep
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
-    parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
+    parting: FloatArray | None = None  # (6, 6) mean square velocity at which these move apart
     led: FloatArray | None = None  # (6,) velocity that led to the pose, if the sweep keeps another
-    in_vain: bool = False  # whether it was looked for elsewhere, as it fits unusually little here
-    searched: float = 0.0  # metres around, in which that was, if no acceleration leads here
+    in_vain: bool = False  # whether it fits unusually little, and was found nowhere else
+    searched: float = 0.0  # radius of that search, metres, if no acceleration leads here
     beside_imu: bool = False  # whether gyro and accelerometer had a say in the solve
     contrary: str = ""  # sentence for the user if the sweep fits better without the IMU
 
@@ -80,7 +80,7 @@ class Found:
 class Lost:
     """The outcome of a search that found nothing, with a sentence for the user."""
 
-    solution: Solution  # of no pose, with the matches at the expected one
+    solution: Solution  # unsolved, with the matches at the expected pose
     message: str
 
 
@@ -92,9 +92,9 @@ def found_at(frame: Frame, solution: Solution) -> Found:
 def doubtful(
     frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray
 ) -> Doubt | None:
-    """Why the solution of a sweep is doubtful, so that the sweep must be searched for, if it is.
+    """Why a solution is doubtful and the sweep has to be searched for; None if it is not.
 
-    ``last_twist`` is the (6,) body velocity of the last sweep: the prediction may be a user's.
+    ``last_twist`` is the (6,) body velocity of the last sweep; the prediction may be a user's.
     """
     moment = frame.matcher.last
     if not monitor.config.enabled or moment is None:
@@ -193,10 +193,10 @@ def placed(
 def _solved(frame: Frame, solver: ScanSolver) -> Found:
     """The sweep as the scan alone has it; beside the IMU, if the scan leads elsewhere.
 
-    Where much repeats, as on stairs, features that belong to what is not mapped yet match what is
-    next to it, and lead there. If the IMU is right, what is matched where it has the sweep leads
-    nowhere else, and fits as well. Where the same matches agree, it is no other place. A classical
-    solver has no place for what the IMU says.
+    Where much repeats, as on stairs, features of a step that is not mapped yet match the one beside
+    it, and lead there. So a scan that contradicts the IMU is solved once more with the prediction
+    of the IMU as a factor. That solution counts if it is at another place, fits nearly as well, and
+    its matches alone do not contradict the IMU. A classical solver takes no such factor.
     """
     alone, matcher, expected = frame.solve(solver), frame.matcher, frame.predicted.motion
     if matcher.config.solver.method != "gtsam" or not contradicts(expected, alone):
@@ -218,7 +218,7 @@ def _solved(frame: Frame, solver: ScanSolver) -> Found:
 def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
     """Whether a gyro turned the points of a sweep, and not those of the one before.
 
-    A sweep that a wrong gyro has bent is solved with the turn that bent it, if no sweep before was.
+    If that gyro is wrong it has bent this sweep alone, and the solve confirms the turn.
     """
     return sweep.motion is SweepMotion.GYRO and last.sweep_motion is not SweepMotion.GYRO
 
@@ -228,9 +228,10 @@ def search(
 ) -> Found | Lost:
     """Search for the pose of a sweep whose solution is doubtful.
 
-    One that does not fit is looked for around the expected pose. So is one that may have another
-    optimum, or jumped to where it fits unusually little; that is believed only if the features
-    speak for it. Else one that jumped is solved again with the motion from before.
+    A sweep that does not fit is searched for around the expected pose. So is one that may have
+    another optimum, or has jumped to where it fits unusually little, but another place is believed
+    only if the features speak for it. Else one that has jumped is solved again with the motion from
+    before.
     """
     matcher = frame.matcher
     if doubt is Doubt.MISFIT:
@@ -251,7 +252,7 @@ def search(
 def _as_before(
     frame: Frame, jumped: Found, monitor: FitMonitor, solver: ScanSolver
 ) -> Found | None:
-    """A sweep that jumped, with the motion from before, unless the one that led there fits."""
+    """A sweep that jumped, with the motion from before; None if that which led there fits best."""
     matcher, pose = frame.matcher, jumped.solution.map_T_lidar
     twists = [matcher.posed.twist, jumped.posed.twist]
     found = _with_motion(frame, pose, twists, monitor, solver)
@@ -286,8 +287,8 @@ def _elsewhere(
 ) -> Found | None:  # fmt: skip
     """The sweep in the first of the likely places in which it fits again; None if in none.
 
-    If it ``stays`` where it was solved otherwise, its features must speak against that. Another
-    place is taken in its stead if they speak for that one.
+    If it otherwise ``stays`` where it was solved, its features must speak for the new place against
+    that one. They may then speak for another of the likely places, which is taken instead.
     """
     places = likely_places(frame, solution, monitor, solver)
     other_twist = np.zeros(6) if stays is None else stays.posed.twist
@@ -369,9 +370,10 @@ def _with_motion(
 ) -> Found | None:  # fmt: skip
     """The sweep near a place, with the first velocity of those by which it clearly fits best.
 
-    The last one is what its matches tell, if these are to be asked (``told``): after a gap the
-    velocity is none of those. If it fits again with none, it tells its velocity by itself, as what
-    was blind may have shaken. None if it does not fit then either.
+    One more is tried if the matches are asked as well (``told``), because the velocity after a gap
+    may be none of those: that which they tell. If the sweep fits with none of them, its velocity is
+    found from itself, as that of a lidar that was shaken while it saw nothing. None if it does not
+    fit then either.
     """
     matcher, best = frame.matcher, None
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]

@@ -33,7 +33,7 @@ from loam_gtsam.registration.odometry import (
     timed_rows,
     twist_to,
 )
-from loam_gtsam.registration.planes import match_surfaces, translations_fixed
+from loam_gtsam.registration.planes import match_wide_surfaces, translations_fixed
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, SweepMotion
@@ -429,10 +429,8 @@ class FrameMatcher(Matcher):
         left = np.setdiff1d(self.rows.planes, near.indices, assume_unique=True)
         _, points = self.posed.rows(self.rows.edges[:0], left)
         coarse = self.maps.thinned(config.wide_search)
-        reach = config.wide_search * config.max_distance
-        # Five points across a corner may lie in a plane by accident; seven seldom do.
-        more = config.model_copy(update={"neighbours": config.neighbours + config.neighbours // 2})
-        wide, _ = match_surfaces(points, map_T_lidar.matrix(), coarse, more, reach)
+        pose, planes = map_T_lidar.matrix(), self.maps.planes
+        wide = match_wide_surfaces(points, pose, coarse, planes, config)
         both = joined(near, replace(wide, indices=left[wide.indices]))
         closed = (translations_fixed(both) >= config.wide_below) > (fixed >= config.wide_below)
         return replace(matches, planes=both) if few or closed.any() else matches

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from loam_gtsam.geometry import (
     symmetric_eigenvector,
     transform,
 )
-from loam_gtsam.registration.matches import PlaneMatches, deviations
+from loam_gtsam.registration.matches import PlaneMatches, deviations, subset
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.tags import LEAST_ANGLE, Faces, sines
 from loam_gtsam.voxels.trees import Neighbours
@@ -35,6 +36,8 @@ follow each other meet a floor 14 m away 4 m apart."""
 _KEY = (1 << 18) - 1  # cells along an axis that are told apart: 262 km of a metre
 _UNLIKE = 0.5  # sine of the angle between the normals of a point's own plane and of another surface
 _SURE = 2.0  # standard deviations beyond which a difference is none of noise (95 %)
+_RIM = 4.0
+"""The leverage at the rim of an ellipse that points fill evenly: beyond it a plane extrapolates."""
 
 
 def match_planes(
@@ -70,12 +73,14 @@ def match_surfaces(
     plane_map: CubeMap,
     config: MatchingConfig,
     reach: float,
+    most_leverage: float = np.inf,
 ) -> tuple[PlaneMatches, Faces]:
     """Match plane features with surfaces that show towards the lidar.
 
     Neighbours on two sides of a thin wall make one plane between the two. Where their views say so,
     the plane is fitted to those of this side alone, and there is no match if these are too few.
-    Parameters are those of :func:`match_planes`.
+    Parameters are those of :func:`match_planes`; features of more than ``most_leverage``, see
+    :func:`~loam_gtsam.registration.matches.deviations`, are not matched.
 
     Returns
     -------
@@ -111,7 +116,51 @@ def match_surfaces(
         better = again.planar
         for column, new in zip(fits, again, strict=True):
             column[..., doubtful[better]] = new[..., better]
-    return _matched_planes(points, points_map, rows, fits, map_T_lidar, config, by_range), faces
+    matches = _matched_planes(
+        points, points_map, rows, fits, map_T_lidar, config, by_range, most_leverage
+    )
+    return matches, faces
+
+
+def match_wide_surfaces(
+    points: FloatArray,
+    map_T_lidar: FloatArray,
+    coarse: CubeMap,
+    plane_map: CubeMap,
+    config: MatchingConfig,
+) -> PlaneMatches:
+    """Match plane features with planes through points metres apart, held by the points near by.
+
+    Points of a ``coarse`` map tell how a surface is inclined. Where it lies, the nearest points of
+    ``plane_map`` tell: a wide plane cuts off a piece of a tank or a hill, and so lies behind it
+    wherever it is seen. A plane is not extrapolated, because that would multiply the error of the
+    last poses, by which its points were placed. Other parameters are those of :func:`match_planes`.
+    """
+    # Five points across a corner may lie in a plane by accident; seven seldom do.
+    more = config.model_copy(update={"neighbours": config.neighbours + config.neighbours // 2})
+    reach = config.wide_search * config.max_distance
+    wide, _ = match_surfaces(points, map_T_lidar, coarse, more, reach, _RIM)
+    here, around = transform(map_T_lidar, wide.points), plane_map.neighbourhood(map_T_lidar)
+    near = plane_map.nearest(here, config.neighbours, config.max_distance, around)
+    found = np.isfinite(near.squared)
+    nearest = np.where(found[:, :, None], near.points, 0.0)
+    off = np.einsum("mki,mi->mk", nearest, wide.normals) + wide.offsets[:, None]
+    of_surface = found & (np.abs(off) <= config.plane_tolerance)
+    count = np.maximum(np.count_nonzero(of_surface, axis=1), 1)
+    shares = of_surface / count[:, None]
+    moved = (shares * off).sum(axis=1)
+    distances = wide.distances - moved
+    far = here if config.weight_range == "map" else wide.points
+    weights, sigmas = plane_weights(distances, norm(far.T), config), wide.sigmas
+    if config.fit_uncertainty:
+        assert wide.tilts is not None  # match_surfaces sets the tilts
+        apart = norm((here - np.einsum("mk,mki->mi", shares, nearest)).T)
+        variances = config.point_sigma**2 * (1.0 + 1.0 / count) + (wide.tilts * apart) ** 2
+        sigmas = np.where(of_surface.any(axis=1), np.sqrt(variances), sigmas)
+    held = replace(
+        wide, offsets=wide.offsets - moved, distances=distances, weights=weights, sigmas=sigmas
+    )
+    return subset(held, weights > config.min_weight)
 
 
 def translations_fixed(planes: PlaneMatches) -> FloatArray:
@@ -245,6 +294,7 @@ def _matched_planes(
     map_T_lidar: FloatArray,
     config: MatchingConfig,
     by_range: FloatArray | None = None,
+    most_leverage: float = np.inf,
 ) -> PlaneMatches:
     """The matches of some rows of the points with the planes fitted to their neighbours."""
     normals, offsets, eigenvalues = fits.normals, fits.offsets, fits.eigenvalues
@@ -261,6 +311,7 @@ def _matched_planes(
     aside = np.maximum(dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
+    keep &= leverage <= most_leverage
     sigmas, tilts = deviations(
         eigenvalues[0], eigenvalues[1], leverage, 3, config.neighbours, config
     )

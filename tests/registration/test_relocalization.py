@@ -635,7 +635,7 @@ def test_of_places_where_a_sweep_fits_again_its_features_choose(before, calm, mo
     solution, monitor = frame.solve(before.solver), deepcopy(before.monitor)
     monitor.fits_again = lambda fit: True
     right = solution.map_T_lidar
-    beside = right.retract([0.0, 0.0, 1.5, 2.0, 0.0, 0.0])
+    beside = right.retract([0.0, 0.0, 3.0, 0.0, 1.0, 0.0])
     for places in ([right, beside], [beside, right]):
         monkeypatch.setattr(doubtful_sweeps, "likely_places", lambda *_, p=places: p)
         found = search(frame, solution, monitor, before.solver, Doubt.MISFIT)

@@ -213,11 +213,11 @@ class _Sight:
 
         No match sees them better than noise would, and all together know more than noise makes.
         """
-        if self.weak is not None:
-            over = self.weak.over_noise
-            if over is None or (over * (1.0 - _COMES_BACK) < 1.0).any():
-                return None
-        return None if config.degeneracy != "prior" else self.unseen or self.weak
+        blind = self.weak or self.unseen
+        if config.degeneracy != "prior" or blind is None or blind.over_noise is None:
+            return None
+        together = (blind.over_noise * (1.0 - _COMES_BACK) >= 1.0).all()
+        return self.unseen or self.weak if together else None
 
     def without(self, lost: BoolArray, least: float) -> _Sight:
         """Such that the lost ones of the doubted directions are weak."""

@@ -485,7 +485,7 @@ def test_a_solver_that_was_made_brings_its_settings(sweeps, name):
 
 @pytest.fixture(scope="module")
 def room():
-    world = SimulatedWorld("room", frames=9, columns=300)
+    world = SimulatedWorld("room", frames=9, columns=450)
     return world, list(world)
 
 

@@ -209,7 +209,7 @@ def test_no_direction_is_left_to_lines_that_vanish(left, weak):
 
 
 @pytest.mark.parametrize(
-    ("slope", "hilly", "weak"), [(0.08, True, 0), (0.08, False, 3), (0.04, True, 3)]
+    ("slope", "hilly", "weak"), [(0.08, True, 0), (0.08, False, 3), (0.05, True, 3)]
 )
 def test_planes_are_tried_with_lines_that_do_not_hold_the_pose(slope, hilly, weak):
     """Lines in foliage are wherever the pose is; slopes, each lost in noise, are not.

@@ -42,7 +42,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.errors import check_all, check_kind, is_number
+from loam_gtsam.errors import check_all, check_kind, check_number
 from loam_gtsam.geometry import as_array, as_points, as_unit, as_vector, cross
 from loam_gtsam.types import BoolArray, FloatArray, InputError, check_array
 
@@ -277,8 +277,7 @@ def point_to_plane_factor(
         If a shape is wrong, a value not finite, or the normal not of unit length.
     """
     p, n = as_vector(point, "point"), as_unit(normal, "normal")
-    if not (is_number(offset) and np.isfinite(offset)):
-        raise InputError(f"offset: expected a finite number, got {offset!r}")
+    check_number(offset, "offset")
     noise_dimension(noise, 1)
     residual = partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
     return _pose_factor(key, noise, residual)

@@ -221,10 +221,9 @@ def relative_pose(
     between = poses.atPose3(earlier).between(poses.atPose3(later))
     joint = marginals.jointMarginalCovariance([earlier, later])
     to_later = between.inverse().AdjointMap()
-    of_earlier, crossed = joint.at(earlier, earlier), to_later @ joint.at(earlier, later)
-    return between, to_later @ of_earlier @ to_later.T + joint.at(
-        later, later
-    ) - crossed - crossed.T
+    of_earlier, of_later = joint.at(earlier, earlier), joint.at(later, later)
+    crossed = to_later @ joint.at(earlier, later)
+    return between, to_later @ of_earlier @ to_later.T + of_later - crossed - crossed.T
 
 
 def _new_isam() -> gtsam.ISAM2:

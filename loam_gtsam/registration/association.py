@@ -25,7 +25,7 @@ from loam_gtsam.registration.matches import (
     joined,
     subset,
 )
-from loam_gtsam.registration.planes import leaves_open, match_surfaces, plane_weights
+from loam_gtsam.registration.planes import at_distances, leaves_open, match_surfaces
 from loam_gtsam.types import BoolArray, FloatArray
 
 _TINY = 1e-9
@@ -182,11 +182,7 @@ def rematched(
     edges = edges if keep.all() else subset(edges, keep)
     points_map = transform(pose, p.points)
     distances = dot(points_map.T, p.normals.T) + p.offsets
-    reach = points_map if config.weight_range == "map" else p.points
-    weights = plane_weights(distances, norm(reach.T), config)
-    keep = weights > config.min_weight
-    planes = replace(p, distances=distances, weights=weights)
-    planes = planes if keep.all() else subset(planes, keep)
+    planes = at_distances(p, distances, points_map, config)
     return ScanMatches(edges, planes, faces=matches.faces)
 
 

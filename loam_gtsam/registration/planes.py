@@ -149,18 +149,28 @@ def match_wide_surfaces(
     count = np.maximum(np.count_nonzero(of_surface, axis=1), 1)
     shares = of_surface / count[:, None]
     moved = (shares * off).sum(axis=1)
-    distances = wide.distances - moved
-    far = here if config.weight_range == "map" else wide.points
-    weights, sigmas = plane_weights(distances, norm(far.T), config), wide.sigmas
+    sigmas = wide.sigmas
     if config.fit_uncertainty:
         assert wide.tilts is not None  # match_surfaces sets the tilts
         apart = norm((here - np.einsum("mk,mki->mi", shares, nearest)).T)
         variances = config.point_sigma**2 * (1.0 + 1.0 / count) + (wide.tilts * apart) ** 2
         sigmas = np.where(of_surface.any(axis=1), np.sqrt(variances), sigmas)
-    held = replace(
-        wide, offsets=wide.offsets - moved, distances=distances, weights=weights, sigmas=sigmas
-    )
-    return subset(held, weights > config.min_weight)
+    held = replace(wide, offsets=wide.offsets - moved, sigmas=sigmas)
+    return at_distances(held, wide.distances - moved, here, config)
+
+
+def at_distances(
+    planes: PlaneMatches, distances: FloatArray, points_map: FloatArray, config: MatchingConfig
+) -> PlaneMatches:
+    """Matches whose points, (M, 3) in the map frame, are at other distances (M,) from their planes.
+
+    They have the weights of these distances; those that weigh too little are left out.
+    """
+    far = points_map if config.weight_range == "map" else planes.points
+    weights = plane_weights(distances, norm(far.T), config)
+    keep = weights > config.min_weight
+    planes = replace(planes, distances=distances, weights=weights)
+    return planes if keep.all() else subset(planes, keep)
 
 
 def translations_fixed(planes: PlaneMatches) -> FloatArray:

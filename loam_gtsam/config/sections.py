@@ -337,7 +337,7 @@ class CovarianceConfig(Section):
     """Matches in one cell of this size count as one error, for they share points of the map."""
     ground_cell: float = parameter(0.8, unit="m", low=0.01)
     """A cell of this size is new ground when it is matched for the first time."""
-    drift: float = parameter(2.0, source="docs/maths/covariance.md, equation 6", low=0.0)
+    drift: float = parameter(1.0, source="docs/maths/covariance.md, equation 6", low=0.0)
     """The error of the map grows by this times the share of new ground in a frame's covariance."""
     window: int = parameter(10, low=1, high=10_000)
     """The acceleration that constant velocity misses is averaged over this many frames."""

@@ -277,31 +277,36 @@ def test_a_wall_makes_neither_the_edge_at_its_end_nor_the_floor_known():
     assert since(3, 0) == [2, 1]
 
 
+@pytest.mark.parametrize("of_map", [0.5, 0.25])
 @pytest.mark.parametrize(
     ("frames", "wander"), [(5, 1e9), (5, 0.1), (20, 1e9), (20, 0.1), (20, 0.01), (50, 0.1)]
 )
-def test_drift_beside_an_imu_is_that_of_a_filter_that_makes_its_own_map(frames, wander):
-    """In one dimension: each frame has one new point and forgets the oldest one of its map."""
+def test_drift_beside_an_imu_is_that_of_a_filter_that_makes_its_own_map(frames, wander, of_map):
+    """In one dimension: each frame has one new point and forgets the oldest one of its map.
+
+    Of the scan's covariance the map has a share; four times that is the factor.
+    """
+    rng, runs, noise = np.random.default_rng(frames), 400, np.sqrt(of_map / (1.0 - of_map))
+    factor, both = 4.0 * of_map, 1.0 + noise**2  # of scan and map, the scan's variance being one
     scan = ScanError(
-        covariance=2.0 / frames * np.eye(6),  # of points and map, each of unit variance
-        renewed=2.0 / frames**2 * np.eye(6),
-        information=np.eye(6) / (2.0 / frames + 4.0 / frames**2),
+        covariance=both / frames * np.eye(6),
+        renewed=both / frames**2 * np.eye(6),
+        information=np.eye(6) / (both / frames + 4.0 * factor * both / frames**2),
         user=np.zeros((6, 6)), expected=np.zeros((6, 6)), raw=np.zeros((6, 6)), step=np.zeros(6),
         residual_variance=1.0, effective_matches=1.0,
     )  # fmt: skip
     predicted, known = wander / frames, 0.0
     for _ in range(2000):
         known = 1.0 / (1.0 / (known + predicted) + scan.information[0, 0])
-    told = scan.drift(2.0, known * np.eye(6))
+    told = scan.drift(factor, known * np.eye(6))
     gain = known * scan.information[0, 0]
 
-    rng, runs = np.random.default_rng(frames), 400
-    pose, points, poses = np.zeros(runs), rng.normal(size=(frames, runs)), []
+    pose, points, poses = np.zeros(runs), noise * rng.normal(size=(frames, runs)), []
     for frame in range(500):
         seen = (points + rng.normal(size=points.shape)).mean(axis=0)
         moved = min(predicted, 1.0) ** 0.5 * rng.normal(size=runs)
         pose = gain * seen + (1.0 - gain) * (pose + moved)
-        points[frame % frames] = pose + rng.normal(size=runs)
+        points[frame % frames] = pose + noise * rng.normal(size=runs)
         poses.append(pose)
     far, near = (np.mean((poses[-1] - poses[-1 - k]) ** 2) for k in (400, 100))
     assert 0.7 < np.trace(told) / 6.0 / ((far - near) / 300.0) < 1.7

@@ -22,6 +22,7 @@ from loam_gtsam.registration.relocalization import Fit, any_of, same, same_optim
 from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
 from loam_gtsam.registration.start import early_map, first_sweeps, ways
+from loam_gtsam.studies.evaluation import FIVE_SIGMA
 from loam_gtsam.types import FrameStatus
 
 CONFIG = Config().changed("imu.coupling=off")
@@ -129,7 +130,7 @@ def test_first_motions_that_fit_as_well_are_told(ahead_only):
     error = step.localCoordinates(gtsam.Pose3(world.truth.map_T_lidar[1]))
     assert rivals > 0
     assert np.linalg.norm(error[3:]) > 0.3
-    assert error @ np.linalg.solve(second.covariance, error) < 18.5  # 99.5 % of chi-squared
+    assert error @ np.linalg.solve(second.covariance, error) < FIVE_SIGMA
 
 
 def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_only):

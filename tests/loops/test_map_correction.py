@@ -261,32 +261,24 @@ def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", PREDICTED)
     poses, world = ring(1.15, radius=28.0, step=STEP), World(1)
 
-    def rounds(closing):
-        rng, odometry, jumps = np.random.default_rng(0), [], []
-        mapper = Mapper(config, Drifting(config.solver))
-        loops = LoopMapping(mapper, config)
-        for number, pose in enumerate(poses):
-            features = world.seen(pose, number * 10**8, rng)
-            guess = odometry[-1].compose(poses[number - 1].between(pose)) if number else pose
-            update = mapper.register(features, guess)
-            odometry.append(update.map_T_lidar)
-            jumps.append(np.linalg.norm(guess.localCoordinates(update.map_T_lidar)[3:]))
-            if closing:
-                loops.add(update, features)
-        if not closing:
-            return odometry, jumps
-        to_map = loops.map_T_odom
-        assert loops.map_points()[1].shape[1] == 3
-        return [to_map.compose(pose) for pose in odometry], jumps, loops
-
-    def off(found, first):
-        return max(p.range(q) for p, q in zip(poses[first:], found[first:], strict=True))
-
-    (closed, jumps, loops), (left_open, _) = rounds(True), rounds(False)
+    rng, odometry, jumps, closes = np.random.default_rng(0), [], [], []
+    mapper = Mapper(config, Drifting(config.solver))
+    loops = LoopMapping(mapper, config)
+    for number, pose in enumerate(poses):
+        features = world.seen(pose, number * 10**8, rng)
+        guess = odometry[-1].compose(poses[number - 1].between(pose)) if number else pose
+        update = mapper.register(features, guess)
+        odometry.append(update.map_T_lidar)
+        jumps.append(np.linalg.norm(guess.localCoordinates(update.map_T_lidar)[3:]))
+        closes.append(loops.add(update, features))
+    assert loops.map_points()[1].shape[1] == 3
+    first = closes.index(True)
+    left_open = poses[first].range(odometry[first])  # no loop has moved the map by then
+    closed = [loops.map_T_odom.compose(pose) for pose in odometry]
     assert loops.counts()["on"] >= 3
     assert loops.points_moved > 0
-    assert off(left_open, 76) > 0.5
-    assert off(closed, 76) < 0.5 * off(left_open, 76)
+    assert left_open > 0.5
+    assert max(p.range(q) for p, q in zip(poses[76:], closed[76:], strict=True)) < 0.5 * left_open
     assert max(jumps) < 0.2  # odom is continuous
 
 

@@ -1,6 +1,7 @@
 """Scans that contradict gyro and accelerometer: one of the two is wrong, and nobody knows which."""
 
 from dataclasses import replace
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -13,6 +14,7 @@ from loam_gtsam import (
     FrameStatus,
     ImuSamples,
     RunResult,
+    Scan,
     SimulatedWorld,
     run,
 )
@@ -24,6 +26,12 @@ FELT, SECONDS = 0.8, 2.0  # m/s^2 along x from so many seconds on
 WORDS = "tell another motion than the scans"
 
 
+@cache
+def sweeps() -> list[Scan]:
+    return list(AT_REST)
+
+
+@cache
 def pushed(felt: float, turn: float = 0.0) -> RunResult:
     return run(rested_and_pushed(felt, turn), QUICK)
 
@@ -31,10 +39,10 @@ def pushed(felt: float, turn: float = 0.0) -> RunResult:
 def rested_and_pushed(felt: float, turn: float = 0.0) -> ArrayDataset:
     """A lidar that sees no motion, while its IMU feels one: as on a ship, or among lorries."""
     imu = AT_REST.imu
-    during = ((imu.stamps - AT_REST[0].stamp) * 1e-9 > SECONDS)[:, None]
+    during = ((imu.stamps - AT_REST.stamps[0]) * 1e-9 > SECONDS)[:, None]
     gyro = imu.gyro + during * [0.0, 0.0, turn]
     samples = ImuSamples(imu.stamps, None, gyro, imu.acceleration + during * [felt, 0.0, 0.0])
-    return ArrayDataset(list(AT_REST), imu=samples, sensor=AT_REST.sensor)
+    return ArrayDataset(sweeps(), imu=samples, sensor=AT_REST.sensor)
 
 
 def sigma_x(result: RunResult, frame: int) -> float:
@@ -105,14 +113,13 @@ def test_it_ends_when_both_agree_again_or_after_long():
 
 
 def test_a_dispute_goes_on_in_a_run_that_is_resumed(tmp_path):
-    dataset = rested_and_pushed(FELT)
-    whole = run(dataset, QUICK)
+    dataset, whole = rested_and_pushed(FELT), pushed(FELT)
 
     def stop(number: int, _: object) -> None:
         if number == 33:
             raise KeyboardInterrupt
 
-    first = run(dataset, QUICK, on_frame=stop, checkpoint=Checkpoint(tmp_path, seconds=0.0))
+    first = run(dataset, QUICK, on_frame=stop, checkpoint=Checkpoint(tmp_path))
     assert first.interrupted
     resumed = run(dataset, QUICK, checkpoint=Checkpoint(tmp_path, resume=True))
     for one, other in zip(whole.updates, resumed.updates, strict=True):

@@ -20,6 +20,7 @@ from loam_gtsam.registration.relocalization import (
     Gap,
     NextPiece,
     goes_on,
+    places,
 )
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.studies.evaluation import nees
@@ -29,7 +30,7 @@ AT, AGAIN, LOST = 8, 20, 8
 """The first missing sweep, the first one after the gap, and how many are lost then."""
 CONFIG = Config().changed(
     f"relocalization.new_piece={LOST}", "relocalization.radius=0", "relocalization.max_radius=0",
-    "solver.iterations=5",
+    "solver.iterations=5", "matching.trial_edges=50", "matching.trial_planes=150",
 )  # fmt: skip
 """With a quick search."""
 SOON = 5
@@ -37,6 +38,14 @@ QUICK = CONFIG.changed(f"relocalization.new_piece={SOON}")
 """With :func:`support.quick.begin_quickly` a piece is there after as many sweeps."""
 FORWARD = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
 USUAL = np.repeat([0.5, 2.0], 3) ** 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_places():
+    """What a search tries matters little where it is to find nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(places, "_PLACES", 1)
+        yield
 
 
 @pytest.fixture(scope="module")

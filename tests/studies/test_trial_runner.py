@@ -72,7 +72,7 @@ def test_the_death_of_a_worker_in_the_middle_changes_no_number(tmp_path):
     here = list(trial_runner.run_trials(trials, never))
     flag = tmp_path / "died"
     work = partial(dies, trials[1].id, str(flag))
-    with trial_runner.local_workers(2) as workers:
+    with trial_runner.local_workers(1) as workers:
         rows = list(trial_runner.run_trials(trials, never, workers, work))
     assert flag.exists()
     assert in_order(trials, rows) == repeatable(here)
@@ -104,7 +104,7 @@ def test_a_stop_ends_the_wait_for_workers_and_the_workers(tmp_path):
     rows: list[Row] = []
 
     def run_until_stopped() -> None:
-        with trial_runner.local_workers(2) as pool:
+        with trial_runner.local_workers(1) as pool:
             for row in trial_runner.run_trials(trials, lambda: bool(rows), pool):
                 rows.append(row)
 

@@ -291,8 +291,8 @@ def fed_live(samples):
 
 
 def stream(kind):
-    """Forty seconds of rest and motion, with a gap of 0.3 s."""
-    samples = SimulatedWorld("shaken", frames=400).imu
+    """Thirty seconds of rest and motion, with a gap of 0.3 s."""
+    samples = SimulatedWorld("shaken", frames=300).imu
     rows = np.arange(len(samples.stamps))
     samples = part(samples, (rows < 4000) | (rows > 4060))
     rows = np.arange(len(samples.stamps))[:, None]

@@ -65,18 +65,22 @@ def driven(tmp_path_factory) -> Driven:
     return Driven(result, points, graph, kept)
 
 
-def test_a_position_of_a_users_own_stays_in_the_graph(driven) -> None:
-    without = driven.by_map(replace(driven.saved, own=None))
+@pytest.fixture(scope="module")
+def without(driven) -> float:
+    """The height without that factor."""
+    return driven.by_map(replace(driven.saved, own=None))
+
+
+def test_a_position_of_a_users_own_stays_in_the_graph(driven, without) -> None:
     assert driven.by_map(driven.saved) - without > 0.5 * RAISED
     graph, more = driven.graph.saved(), {"trajectory": driven.result.trajectory}
     alone = refine_run(driven.points, driven.result.updates, graph=graph, **more)
     assert driven.height(alone) - without > 0.5 * RAISED
 
 
-def test_in_the_frame_of_a_run_that_was_merged_it_says_less(driven) -> None:
+def test_in_the_frame_of_a_run_that_was_merged_it_says_less(driven, without) -> None:
     """That frame is known as well as the first place is, to a centimetre."""
     own, places = driven.saved.own, driven.saved.places
-    without = driven.by_map(replace(driven.saved, own=None))
     merged = replace(driven.saved, own=own.within(gtsam.Pose3(), places, 0))
     assert merged.held().poses.size() == len(places) + 1  # the frame
     raised = driven.by_map(merged) - without

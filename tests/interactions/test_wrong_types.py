@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from support.quick import QUICK
 
 import loam_gtsam as api
 from loam_gtsam.datasets.sim import disturbances
@@ -28,7 +29,7 @@ from loam_gtsam.ros.live import LiveMapper
 from loam_gtsam.studies.evaluation import matched_truth, nees, relative_error
 
 WORLD = api.SimulatedWorld("room", frames=5, columns=400)
-CONFIG = api.Config().changed("map.window=[5,5,5]")
+CONFIG = QUICK.changed("map.window=[5,5,5]")
 RESULT = api.run(WORLD, CONFIG)
 SWEEP, UPDATES, TRUTH = WORLD[0], RESULT.updates, WORLD.truth
 FEATURES = api.extract_features(SWEEP, CONFIG)

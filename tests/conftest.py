@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Before numpy is imported: the threads of workers that share two cores get in each other's way.
@@ -11,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import HealthCheck, settings
+from support.quick import begin_quickly
 
 # The same few examples every time; `pytest --hypothesis-profile=thorough` looks for new ones.
 _slow = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
@@ -29,6 +31,14 @@ def speaking_loggers() -> None:
     for name, logger in logging.Logger.manager.loggerDict.items():
         if name.startswith("loam_gtsam") and isinstance(logger, logging.Logger):
             logger.disabled = False
+
+
+@pytest.fixture(scope="module")
+def quick_start() -> Iterator[None]:
+    """For all runs of a module, also of its fixtures: see support/quick.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        begin_quickly(patch)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.list_dataset import ListDataset
-from support.quick import QUICK
+from support.quick import QUICK, begin_quickly
 
 from loam_gtsam import pipeline as pipeline_module
 from loam_gtsam.config import Config, ImuConfig, preset
@@ -603,7 +603,8 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
         run(data_of(shaken, sweeps[:1]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
 
-def test_foliage_does_not_hold_the_pose():
+def test_foliage_does_not_hold_the_pose(monkeypatch):
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("trees", frames=35, columns=600, seed=2)
     # Without poles: the trunks alone would do.
     config = Config().changed({"features.post_depth": 0.0, "imu.coupling": "off"})

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.cli import loam
 from support.list_dataset import ListDataset
-from support.quick import QUICK_START
+from support.quick import QUICK_START, begin_quickly
 
 from loam_gtsam.cli import report
 from loam_gtsam.cli import run as run_command
@@ -438,6 +438,7 @@ def test_run_says_that_the_imu_is_mounted_otherwise():
 
 def test_inspect_names_an_imu_that_is_late(monkeypatch):
     """With the offset that is named there is nothing to say."""
+    begin_quickly(monkeypatch)
     imu = SimulatedWorld("shaken", frames=60).imu
     late = replace(imu, stamps=imu.stamps + 100_000_000)
     monkeypatch.setattr(SimulatedWorld, "imu", late)
@@ -603,7 +604,8 @@ def test_sweep_is_the_old_name_of_study_and_says_so_and_no_help_is_cut_off(monke
     assert "..." not in commands
 
 
-def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones() -> None:
+def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones(monkeypatch) -> None:
+    begin_quickly(monkeypatch)
     spec = "sim:street_loop?frames=45&columns=450"
     longer = "--set", "imu.coupling=off", "--set", "sensor.range_offset=-0.03"
     done = loam("run", spec, "--output", "out", "--no-plot", *longer)
@@ -616,7 +618,8 @@ def test_a_run_whose_ranges_look_too_long_is_refined_with_right_ones() -> None:
     assert report["after"]["ate_rmse_m"] < 0.5 * summary["accuracy"]["ate_rmse_m"]
 
 
-def test_a_run_whose_beams_disagree_writes_what_they_are_off_by() -> None:
+def test_a_run_whose_beams_disagree_writes_what_they_are_off_by(monkeypatch) -> None:
+    begin_quickly(monkeypatch)
     spec = "sim:garage?frames=55&columns=450&seed=1&start=moving"
     wrong = [
         [float(2 * beam - 15), (0.015 if beam % 2 else -0.015), 0.0, 0.0] for beam in range(16)

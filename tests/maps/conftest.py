@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from support.quick import begin_quickly
 from support.rooms_map import Mapped, world
 
 from loam_gtsam.config import Config
@@ -17,7 +18,9 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
     drive = world()
     config = Config()
     places = config.pose_graph.changed(keyframe_distance=0.5)
-    result = run(drive, config.changed(pose_graph=places))
+    with pytest.MonkeyPatch.context() as patch:
+        begin_quickly(patch)
+        result = run(drive, config.changed(pose_graph=places))
     path = tmp_path_factory.mktemp("maps") / "rooms.lgmap"
     assert result.pipeline is not None
     save_map(path, result.pipeline)

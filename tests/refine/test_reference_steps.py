@@ -9,6 +9,8 @@ from loam_gtsam import SimulatedWorld, run
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, ReferenceSteps, SweepPoints
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 COUNT, PERIOD, AWAY = 60, 0.1, -0.05  # sweeps, seconds from one to the next, to the reference
 AXIS = np.array([0.3, -0.5, 0.8, 0.4, 0.2, -0.6])
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cli import shown
+from support.quick import begin_quickly
 from support.solved import POSE, solved, surroundings
 from support.walls import MAP, MIDDLE, face, matched
 
@@ -201,7 +202,8 @@ def test_a_run_tells_the_offset_of_its_ranges(clean: RunResult, mapped: RunResul
         assert summarise(result)["ranges"] == ranges.as_dict()
 
 
-def test_inspect_tells_it(too_long: ArrayDataset) -> None:
+def test_inspect_tells_it(too_long: ArrayDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin_quickly(monkeypatch)
     assert "problem: the ranges look" in shown(inspection(too_long, ALONE)[0])
 
 

@@ -23,6 +23,8 @@ from loam_gtsam.ros.bag_writer import BagWriter
 from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, ros_covariance
 from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, OutputError
 
+pytestmark = pytest.mark.usefixtures("quick_start")
+
 START = 1_700_000_000_123_456_789
 NAMES = ("run.bag", "run.mcap", "run")
 

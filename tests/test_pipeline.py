@@ -60,7 +60,8 @@ def test_denser_sensors(sensor):
     assert absolute_error(result.trajectory, world.truth).rmse < 0.01
 
 
-def test_scan_to_scan_guess_maps_as_well():
+def test_scan_to_scan_guess_maps_as_well(monkeypatch):
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("street_loop", frames=22, columns=450)
     config = Config().changed("odometry.method=scan_to_scan")
     result = run(world, config)
@@ -141,8 +142,9 @@ def test_same_input_same_bits_at_any_speed():
     assert np.array_equal(whole.plane_points, pipeline.mapper.map_points()[1])
 
 
-def test_recorded_odometry_is_the_guess():
+def test_recorded_odometry_is_the_guess(monkeypatch):
     """Features of another front end, its odometry drifting in a frame of its own."""
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("street_loop", frames=31, columns=600)
     truth = world.truth.map_T_lidar
     start = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 2.0), np.array([5.0, 6.0, 7.0]))
@@ -410,7 +412,10 @@ def test_in_a_gap_of_the_imu_frames_go_without(shaken, sweeps):
     assert ate(result, shaken) < 0.03
 
 
-def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(shaken, sweeps):
+def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(
+    shaken, sweeps, monkeypatch
+):
+    begin_quickly(monkeypatch)
     updates = run(data_of(shaken, sweeps[:13], lambda s: (s < 1.02) | (s > 1.6))).updates
     truth = [gtsam.Pose3(pose) for pose in shaken.truth.map_T_lidar[:14]]
     for number in (8, 9, 10, 11):  # two sweeps with a gyro, one with a fifth of one, one without
@@ -422,7 +427,10 @@ def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(shaken, 
 
 
 @pytest.mark.parametrize("angles", [(180.0, 0.0, 0.0), (0.0, 0.0, 90.0)])
-def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(shaken, sweeps, angles):
+def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(
+    shaken, sweeps, angles, monkeypatch
+):
+    begin_quickly(monkeypatch)
     sweeps = sweeps[:24]
     data = data_of(shaken, sweeps)
     config = effective_config(with_imu(lidar_R_imu_deg=angles), data)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.quick import begin_quickly
 
 from loam_gtsam.config import Config, ImuConfig, MatchingConfig
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
@@ -26,7 +27,8 @@ def test_the_rings_of_one_sweep_on_open_ground_are_enough_with_a_wide_search(wid
         assert np.abs(error[2, :2]).max() < 0.003
 
 
-def test_a_way_between_poles_on_rough_ground_holds():
+def test_a_way_between_poles_on_rough_ground_holds(monkeypatch):
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("sparse_terrain", frames=28, columns=900)
     result = run(world, alone())
     error = absolute_error(result.trajectory, world.truth)

@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from support.quick import begin_quickly
 
 from loam_gtsam import Config, FrameStatus, SimulatedWorld, run
 from loam_gtsam.config import FeatureConfig
@@ -144,7 +145,8 @@ def test_a_lidar_without_rings_is_mapped(scene, sensor, frames, metres):
     assert wrong == 0
 
 
-def test_points_in_any_order_and_without_times_are_mapped():
+def test_points_in_any_order_and_without_times_are_mapped(monkeypatch):
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("room", frames=14, columns=450, speed=0.1)
     rng = np.random.default_rng(0)
     scans = [Scan(rng.permutation(scan.points), scan.stamp) for scan in world]
@@ -155,7 +157,8 @@ def test_points_in_any_order_and_without_times_are_mapped():
     assert off.max() < 0.03
 
 
-def test_two_lidars_in_one_scan_are_mapped():
+def test_two_lidars_in_one_scan_are_mapped(monkeypatch):
+    begin_quickly(monkeypatch)
     lidar = SimulatedWorld("corridor", frames=16, columns=450, seed=3)
     lidar_T_second = gtsam.Pose3(gtsam.Rot3.Roll(1.2), np.array([0.3, -0.4, 0.2])).matrix()
     second = lidar.seen_from(lidar_T_second)
@@ -174,7 +177,8 @@ def test_two_lidars_in_one_scan_are_mapped():
     assert (wrong, off.max() < 0.02) == (0, True)
 
 
-def test_scan_to_scan_needs_rings_and_leaves_the_prediction_without():
+def test_scan_to_scan_needs_rings_and_leaves_the_prediction_without(monkeypatch):
+    begin_quickly(monkeypatch)
     world = SimulatedWorld("rooms", sensor="mid360", frames=8)
     result = run(world, Config().changed("odometry.method=scan_to_scan", "imu.coupling=off"))
     assert errors(result, world)[0].max() < 0.05

@@ -9,15 +9,12 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import positive_root, symmetric
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.types import FloatArray, MapUpdate, SweepMotion
 
-_LASTING = 0.3
-"""Share of a scan's covariance that stays for some frames and that no filter averages: consecutive
-innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
 _PAUSE = 1.0
 """Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
 sweeps took that were on neither clock."""
@@ -51,7 +48,6 @@ class _Middle:
     to_reference: FloatArray  # (6, 6) adjoint from the middle to the reference time
     reference_stamp: int
     of_state: FloatArray | None = None  # (6, 9) by which errors of pose and velocity get there
-    lasting: FloatArray | None = None  # (6, 6) root of what its scan shares with the next one's
 
 
 class FrameErrors:
@@ -145,19 +141,15 @@ class FrameErrors:
     ) -> tuple[_Middle, FloatArray, FloatArray]:
         """As :meth:`_by_scan`, of a frame whose velocity is known too."""
         last, to_reference = self._last, now.to_reference
-        # What consecutive scans have in common
-        of_scan = symmetric(to_reference @ now.covariance @ to_reference.T)
-        lasting = np.sqrt(_LASTING) * positive_root(of_scan)
         back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
         of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
         turned = np.zeros((6, 6))
         turned[:3, :3] = self._missed(sweep, motion)[:3, :3]
-        covariance = of_state @ fused.covariance @ of_state.T + turned + lasting @ lasting.T
+        covariance = of_state @ fused.covariance @ of_state.T + turned
         shared = np.zeros((6, 6))
-        if last is not None and last.of_state is not None and last.lasting is not None:
-            shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
-        at_middle = fused.covariance[:6, :6]
-        now = replace(now, covariance=at_middle, of_state=of_state, lasting=lasting)
+        if last is not None and last.of_state is not None:
+            shared = of_state @ fused.across @ last.of_state.T
+        now = replace(now, covariance=fused.covariance[:6, :6], of_state=of_state)
         return now, covariance, shared
 
     def _missed(

@@ -205,7 +205,7 @@ _CONFIG = QUICK.changed("pose_graph.keyframe_distance=0.5", "loops.enabled=true"
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedWorld, list[Path]]:
-    """Two parts of a drive; the end of each is said to lie 20 cm aside."""
+    """Two parts of a drive; the end of each is said to lie 30 cm aside."""
     world = SimulatedWorld("rooms", frames=CUTS[-1][-1], columns=300, speed=3.0, seed=1)
     files = []
     for start, end in CUTS:
@@ -214,7 +214,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedWorld, lis
         assert done.pipeline.loops is not None
         graph = done.pipeline.loops.graph
         last = graph.keyframes[-1].index
-        aside = graph.pose(last).translation() + np.array([0.0, 0.0, 0.2])
+        aside = graph.pose(last).translation() + np.array([0.0, 0.0, 0.3])
         graph.add_position(last, aside, 0.01**2 * np.eye(3))
         files.append(tmp_path_factory.mktemp("part") / "map.lgmap")
         save_map(files[-1], done.pipeline)

@@ -11,7 +11,7 @@ from loam_gtsam.factors import plane_rows
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import EdgeMatches
 from loam_gtsam.registration.solvers import Solution, match_rows
-from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.scan_error import _STAYS, ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 
 CONFIG = CovarianceConfig()
@@ -291,7 +291,7 @@ def test_drift_beside_an_imu_is_that_of_a_filter_that_makes_its_own_map(frames, 
     scan = ScanError(
         covariance=both / frames * np.eye(6),
         renewed=both / frames**2 * np.eye(6),
-        information=np.eye(6) / (both / frames + 4.0 * factor * both / frames**2),
+        information=np.eye(6) / (both / frames + _STAYS * factor * both / frames**2),
         user=np.zeros((6, 6)), expected=np.zeros((6, 6)), raw=np.zeros((6, 6)), step=np.zeros(6),
         residual_variance=1.0, effective_matches=1.0,
     )  # fmt: skip

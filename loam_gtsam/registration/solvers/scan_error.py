@@ -23,7 +23,7 @@ _TOLD = 6.0
 the planes: the few that decide a pose may agree by chance."""
 _STAYS = 4.0
 """Times the drift by which new ground counts beside an IMU: what a scan is off by it stays in the
-map. With 1 or 2 the poses are 4 or 2 % worse (ATE, 18 worlds), with 8 as good."""
+map. Chosen by the table of worlds: docs/consistency.md."""
 _LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
 _LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
 

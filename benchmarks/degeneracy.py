@@ -31,7 +31,7 @@ from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers import match_rows
+from loam_gtsam.registration.solvers import MotionPrior, match_rows
 from loam_gtsam.registration.solvers.classical import degeneracy_projector, loam_rows
 from loam_gtsam.types import FloatArray
 
@@ -94,7 +94,7 @@ def off(step: Step) -> tuple[FloatArray, FloatArray]:
 def prior(step: Step) -> tuple[FloatArray, FloatArray]:
     """The expected pose as a factor along weak directions, the scan along the others."""
     keep = np.eye(6) - step.weak
-    added = step.weak.T @ step.precision @ step.weak
+    added = MotionPrior(gtsam.Pose3(), step.precision).along(step.weak).information
     covariance = np.linalg.inv(keep.T @ step.information @ keep + added).astype(np.float64)
     return covariance @ (keep.T @ step.right + added @ step.expected), covariance
 

@@ -21,6 +21,8 @@ _NO_KEYS: IntArray = np.empty(0, np.int64)
 _NO_TAGS = tags_of(0, 0)
 _SECOND = np.int64(-(1 << 63))
 """The sign bit: it is set in the keys of points that are second in their voxels."""
+_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd numbers without a pattern: 2^64 over the golden ratio, and two primes of xxHash."""
 
 
 class CubePoints(NamedTuple):
@@ -161,6 +163,20 @@ def joined(parts: Sequence[CubePoints]) -> CubePoints:
     return CubePoints(*map(np.concatenate, zip(Cube().content, *parts, strict=True)))
 
 
+def chances_of(content: CubePoints) -> IntArray:
+    """Numbers (N,) by owner, and among the points of one by the digits of where they are.
+
+    The features of a sweep are sorted along an axis of the lidar. If the first of those in a voxel
+    stayed, it would always lie on the same side of their mean, and a wall that is made of such
+    points in front of where it is.
+    """
+    x, y, z = np.ascontiguousarray(content.points, np.float64).view(np.uint64).T
+    mixed = x * _MIX[0] ^ y * _MIX[1] ^ z * _MIX[2]
+    owners = content.tags[:, 0].astype(np.int64) << 32
+    chances: IntArray = owners | (mixed >> np.uint64(32)).astype(np.int64)
+    return chances
+
+
 def _order(keys: IntArray, numbers: IntArray) -> IntArray:
     """Rows (N,) by number, then by key, then as given; in half of ``np.lexsort``'s time."""
     order = keys.argsort()  # numpy's fastest, but equal keys come in any order
@@ -258,10 +274,14 @@ class SortedPoints(NamedTuple):
         return starts, dict(zip(map(cube_index, cubes), parts, strict=True))
 
     def firsts(self) -> dict[CubeIndex, VoxelPoints]:
-        """The first point of each voxel, by cube."""
+        """One point of each voxel, by cube: of the lowest owner, and there by chance."""
         starts, parts = self.voxels()
-        keys, points = self.keys[starts], self.content.points.take(starts, axis=0)
-        tags = self.content.tags.take(starts, axis=0)
+        chances = chances_of(self.content)
+        least = np.minimum.reduceat(chances, starts)
+        chosen = np.flatnonzero(chances == least.repeat(np.diff(starts, append=len(chances))))
+        chosen = chosen[chosen.searchsorted(starts)]  # of points that are the same, one
+        keys, points = self.keys[starts], self.content.points.take(chosen, axis=0)
+        tags = self.content.tags.take(chosen, axis=0)
         return {
             index: VoxelPoints(keys[part], points[part], tags[part])
             for index, part in parts.items()

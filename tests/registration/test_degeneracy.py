@@ -16,7 +16,13 @@ from loam_gtsam.pipeline import effective_config
 from loam_gtsam.registration.degeneracy import by_lines, localizability, unseen_by_planes
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, joined, subset
 from loam_gtsam.registration.report import status_of
-from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Matcher, MotionPrior
+from loam_gtsam.registration.solvers import (
+    POSE_KEY,
+    GtsamSolver,
+    Matcher,
+    MotionPrior,
+    make_solver,
+)
 from loam_gtsam.types import FrameStatus
 
 LEAST = SolverConfig().min_aligned
@@ -377,6 +383,55 @@ def test_along_the_weak_direction_the_expected_motion_stays(policy):
     claimed = along @ solution.information @ along
     assert claimed == pytest.approx(1e4 if policy == "prior" else 1e10, rel=0.1)
     assert along @ solution.scan_information @ along < 1e-6 * claimed
+
+
+def wall_ahead():
+    """Points of a narrow view: a wall 8 m ahead, floor and ceiling before it; nothing tells y."""
+    rng = np.random.default_rng(4)
+    wall, level = (rng.uniform(-1, 1, (600, 3)) * np.array([1.0, 3.0, 2.0]) for _ in range(2))
+    wall[:, 0], level[:, 0] = 8.0, rng.uniform(5.0, 8.0, 600)
+    level[:, 2] = 2.0 * np.sign(level[:, 2])
+    normals = np.repeat(np.eye(3)[[0, 2]], 600, axis=0)
+    return ScanMatches(NO_EDGES, surfaces(np.concatenate([wall, level]), normals, noise=0.05))
+
+
+@pytest.mark.parametrize("method", ["gtsam", "loam", "aloam"])
+def test_a_lidar_that_turned_less_than_expected_has_not_moved_aside(method):
+    """About the wall that it sees, the turn would be one of the lidar around a far point."""
+    turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.02), np.zeros(3))
+    guess, matches = POSE.compose(turn), wall_ahead()
+    solver = make_solver(SolverConfig(method=method, inner_iterations=5))
+    solution = solver.solve(lambda _: matches, guess, (), MotionPrior(guess, 1e4 * np.eye(6)))
+    error = POSE.localCoordinates(solution.map_T_lidar)
+    assert solution.n_weak == 1
+    assert abs(error[2]) < 0.004  # the scan sees that it has not turned
+    assert abs(error[4]) < 0.005  # 0.02 rad times 7 m are 140 mm
+    share = np.linalg.solve(solution.information, solution.expected)
+    if method == "gtsam":
+        assert np.abs(share - MotionPrior(guess, 1e4 * np.eye(6)).share(share)).max() < 1e-6
+        assert np.linalg.norm(share @ np.eye(6)[2]) < 0.1  # of a turn, nothing along y
+
+
+def test_the_share_of_the_expected_motion_follows_what_is_known_of_it():
+    """A free turn about a pole, and a lidar that may slide more easily than turn."""
+    pole = np.array([0.0, 0.0, 1.0, 0.0, -4.0, 0.0])[:, None]
+    across = np.array([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    directions = pole @ across
+    for sigma, moved in ((1e-3, 0.0), (1e3, 1.0)):
+        motion = MotionPrior(POSE, np.diag(np.array([1, 1, 1, 1, sigma, 1.0]) ** -2.0))
+        share = motion.share(directions)
+        np.testing.assert_allclose(share @ share, share, atol=1e-9)
+        np.testing.assert_allclose(share @ pole, pole, atol=1e-6)
+        # Of an expected turn about the lidar itself, the pose takes what is likely.
+        assert (share @ np.eye(6)[2])[2] == pytest.approx(moved, abs=1e-3)
+        along = motion.along(directions).information
+        assert np.linalg.matrix_rank(along) == 1
+        assert (pole.T @ along @ pole).item() == pytest.approx(
+            (pole.T @ motion.information @ pole).item()
+        )
+    nothing = MotionPrior(POSE, np.zeros((6, 6)))
+    assert nothing.share(directions) is directions
+    assert not nothing.along(directions).information.any()
 
 
 def test_switched_off_the_noise_is_believed():

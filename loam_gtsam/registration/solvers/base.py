@@ -23,6 +23,7 @@ SCAN_VARIANCE = 4.0
 does not tell it: where some direction is not seen, the map was made by the same guesses as the
 scan, and agrees with them."""
 
+_RANK = 1e-6  # singular value over the largest one, below which there is no direction
 _FAR = 1e4
 """Metres from its guess at which a pose is no solution: a sweep has no map there to match."""
 
@@ -88,7 +89,8 @@ class Solution:
         ``beacons`` and the expected motion count; None if there are none
     beacons : (R,) mask of the rows that count along ``unseen``, though not along ``weak``
     rows : the matches with the weights of the last association; None if the solver has no rows
-    expected : (6, 6) part of ``information`` that the expected motion added; None if none
+    expected : (6, 6) what the expected motion added, to ``information`` as well if there are
+        ``rows``; None if none
     """
 
     map_T_lidar: gtsam.Pose3
@@ -122,11 +124,13 @@ class Solution:
 
     @property
     def scan_information(self) -> FloatArray:
-        """(6, 6) ``information`` without the degenerate directions."""
+        """(6, 6) ``information`` without the degenerate directions and the expected motion."""
         if self.weak is None:
             return self.information
-        keep = np.eye(6) - self.weak
-        kept: FloatArray = keep.T @ self.information @ keep
+        information, keep = self.information, np.eye(6) - self.weak
+        if self.expected is not None and self.rows is not None:
+            information = information - self.expected
+        kept: FloatArray = keep.T @ information @ keep
         return kept
 
 
@@ -176,7 +180,25 @@ class MotionPrior:
 
     def along(self, directions: FloatArray) -> MotionPrior:
         """The expected pose along directions alone, given by their (6, 6) projector."""
-        return replace(self, information=directions.T @ self.information @ directions)
+        share = self.share(directions)
+        return replace(self, information=share.T @ self.information @ share)
+
+    def share(self, directions: FloatArray) -> FloatArray:
+        """(6, 6) the part of a motion that the expected pose decides beside a scan.
+
+        The scan fixes all motions but those of some directions, given by their (6, 6) projector.
+        Along these the pose is where it is most likely, given the others: a lidar that has turned
+        less than expected has not moved aside for that. Where gyro and accelerometer tell the
+        motion, the others are off by the noise of the scan, which tells nothing of these
+        directions: the projector stays. See docs/maths/degeneracy.md.
+        """
+        if self.measured or not self.information.any():
+            return directions
+        spanned, sizes, _ = np.linalg.svd(directions)
+        basis = spanned[:, sizes > _RANK * sizes[0]]
+        pulled = basis.T @ self.information
+        share: FloatArray = basis @ np.linalg.pinv(pulled @ basis, hermitian=True) @ pulled
+        return share
 
     def factor(self, directions: FloatArray | None = None) -> gtsam.NonlinearFactor:
         """The expected pose as a factor on :data:`POSE_KEY`.

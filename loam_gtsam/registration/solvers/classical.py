@@ -73,23 +73,24 @@ class _SolverWithoutPriors(ABC):
             nonlocal seen, weak, kept
             if kept is None:  # the first matches decide which directions are degenerate
                 seen = None if motion is None else localizability(matches, pose)
-                kept, weak = self._kept(matches, pose, self._weak(seen))
+                kept, weak = self._kept(matches, pose, self._weak(seen, motion))
             return self._optimise(matches, pose, kept)
 
         found = rematch(associate, guess, self.config, optimise, stop=self._stop)
         if not found.solved or motion is None or weak is None:
             return replace(found, localizability=seen)
         rows = np.zeros(2 * len(found.matches.edges) + len(found.matches.planes), np.bool_)
-        added = motion.along(weak).information
+        added = weak.T @ motion.information @ weak
         return replace(
             found, localizability=seen, weak=weak, unseen=weak, beacons=rows, expected=added
         )
 
-    def _weak(self, seen: Localizability | None) -> FloatArray | None:
+    def _weak(self, seen: Localizability | None, motion: MotionPrior | None) -> FloatArray | None:
         """(6, 6) projector onto the degenerate directions; None if there are none."""
-        if seen is None or self.config.degeneracy == "off":
+        if seen is None or motion is None or self.config.degeneracy == "off":
             return None
-        return seen.projector(self.config.min_aligned)
+        weak = seen.projector(self.config.min_aligned)
+        return None if weak is None else motion.share(weak)
 
     @abstractmethod
     def _kept(

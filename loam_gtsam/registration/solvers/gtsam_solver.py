@@ -235,12 +235,11 @@ class _Sight:
         if self.weak is None or expected is None:
             return found
         weak = self.weak.projector
-        keep, added = np.eye(6) - weak, expected.along(weak).information
-        information = keep.T @ found.information @ keep + added
+        seen, added = replace(found, weak=weak).scan_information, expected.along(weak).information
         beacons = None if found.beacons is None else np.zeros_like(found.beacons)
         return replace(
             found, localizability=self.scan, weak=weak, unseen=weak, beacons=beacons,
-            information=information, expected=added,
+            information=seen + added, expected=added,
         )  # fmt: skip
 
 

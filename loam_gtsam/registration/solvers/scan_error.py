@@ -186,7 +186,7 @@ def scan_error(
     step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
     parts = meat + priors, renewed, total - expected
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
-    shares = bread @ keep.T @ priors @ keep, bread @ expected
+    shares = bread @ keep.T @ (priors - expected) @ keep, bread @ expected
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
     times = np.zeros(len(residuals)) if seconds is None else seconds
     by_velocity, by_acceleration = (

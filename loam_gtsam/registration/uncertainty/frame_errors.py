@@ -44,8 +44,8 @@ class _Middle:
     stamp: int  # nanoseconds of the middle
     map_T_lidar: gtsam.Pose3
     covariance: FloatArray  # (6, 6) of the scan's own error
-    kept: FloatArray  # (6,) share of the scan's own error in the pose at the reference time
-    to_reference: FloatArray  # (6, 6) adjoint from the middle to the reference time
+    with_own: FloatArray  # (6, 6) of that error with the frame's own at the reference time
+    to_reference: FloatArray  # (6, 6) adjoint from the middle to there
     reference_stamp: int
     of_state: FloatArray | None = None  # (6, 9) by which errors of pose and velocity get there
 
@@ -93,7 +93,8 @@ class FrameErrors:
         """
         last = self._last
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
-        now = _Middle(sweep.stamp, middle, scan.covariance, np.ones(6), to_reference, update.stamp)
+        none = np.zeros((6, 6))
+        now = _Middle(sweep.stamp, middle, scan.covariance, none, to_reference, update.stamp)
         if fused is None:
             now, covariance, shared = self._by_scan(now, sweep, motion, scan)
             if self._paused:
@@ -125,11 +126,12 @@ class FrameErrors:
         if last is not None:
             across = share[:, None] * now.map_T_lidar.between(last.map_T_lidar).AdjointMap()
             covariance = covariance + across @ last.covariance @ across.T
-            shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
+            shared = to_reference @ across @ last.with_own
         strayed = share * self._strayed
         covariance = covariance + self._missed(sweep, motion, scan) + np.outer(strayed, strayed)
         covariance = to_reference @ covariance @ to_reference.T
-        return replace(now, kept=kept), covariance, shared
+        with_own = (now.covariance * kept) @ to_reference.T
+        return replace(now, with_own=with_own), covariance, shared
 
     def _by_imu(
         self,
@@ -149,7 +151,10 @@ class FrameErrors:
         shared = np.zeros((6, 6))
         if last is not None and last.of_state is not None:
             shared = of_state @ fused.across @ last.of_state.T
-        now = replace(now, covariance=fused.covariance[:6, :6], of_state=of_state)
+        with_own = fused.covariance[:6] @ of_state.T
+        now = replace(
+            now, covariance=fused.covariance[:6, :6], with_own=with_own, of_state=of_state
+        )
         return now, covariance, shared
 
     def _missed(

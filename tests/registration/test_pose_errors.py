@@ -286,6 +286,26 @@ def own_errors(
     return own
 
 
+def test_a_frame_by_its_scan_after_one_beside_an_imu_has_a_motion_of_positive_variance():
+    """The IMU knew the place at the start of that sweep better than in the middle."""
+    errors, accelerations = FrameErrors(0.0), Accelerations(10, np.zeros(6))
+    pose = np.diag([1e-8, 1e-8, 1e-8, 1e-4, 1e-4, 1e-4])
+    faster = np.vstack([np.eye(6), np.hstack([np.zeros((3, 3)), np.eye(3) / 0.05])])
+    fused = SimpleNamespace(
+        covariance=faster @ pose @ faster.T + 1e-10 * np.eye(9), across=np.zeros((9, 9))
+    )
+    scan = ScanError(pose, np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    found = []
+    for k, by_imu in enumerate((fused, None)):
+        sweep = _Sweep(k * FRAME, SweepMotion.GYRO)
+        update = MapUpdate(sweep.stamp, gtsam.Pose3(), FrameStatus.OK)
+        found.append(errors.of(update, sweep, gtsam.Pose3(), scan, accelerations, by_imu))
+    first, second = found
+    assert first.covariance[3, 3] < 1e-6  # 0.05 s before the middle, which is off by a centimetre
+    motion = first.covariance + second.covariance - second.shared - second.shared.T
+    assert np.linalg.eigvalsh(motion).min() > 0.0
+
+
 def test_what_a_constant_velocity_misses():
     """Eighth of a T^2 from the chord, and a twenty-fourth for the sweep itself."""
     still, fast = (own_errors(a, np.zeros((6, 6)))[3, 3] for a in (0.0, 3.0))

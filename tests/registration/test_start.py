@@ -102,11 +102,11 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
 
 @pytest.fixture(scope="module")
 def features_ahead():
-    """A drive whose lidar sees 50 degrees of an avenue."""
-    world = SimulatedWorld("avenue", frames=12, seed=1, columns=900, start="moving")
+    """A drive whose lidar sees 60 degrees of an avenue."""
+    world = SimulatedWorld("avenue", frames=12, seed=4, columns=900, start="moving")
     features = []
     for scan in world:
-        ahead = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(25.0)
+        ahead = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(30.0)
         points = np.where(ahead[:, None], scan.points, np.nan).astype(np.float32)
         features.append(extract_features(replace(scan, points=points), CONFIG))
     return world, features

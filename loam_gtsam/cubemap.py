@@ -185,9 +185,9 @@ class CubeMap:
 
         With the policy ``centroid`` a voxel holds the mean of the point it had and the new ones,
         the old one counting once: what LOAM's voxel filter does to a cube after each sweep. With
-        ``settled`` the first point of a voxel stays, of several in one call any, and search trees
-        are kept while few of their points are new. Points outside the window, or beyond the voxel
-        grid (about 2^20 voxels from the origin), are not taken and counted in ``stats.outside``.
+        ``settled`` the first point of a voxel stays, and search trees are kept while few of their
+        points are new. Points outside the window, or beyond the voxel grid (about 2^20 voxels from
+        the origin), are not taken and counted in ``stats.outside``.
 
         Parameters
         ----------

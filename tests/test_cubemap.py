@@ -11,8 +11,6 @@ from loam_gtsam.cubemap import CubeMap, grid_of
 from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, InputError
 from loam_gtsam.voxels.archive import Archive
-from loam_gtsam.voxels.cubes import CubePoints
-from loam_gtsam.voxels.tags import tags_of
 
 ALL_AROUND = MapConfig(field_of_view=False)
 CENTROID = MapConfig(insertion="centroid")
@@ -299,28 +297,3 @@ def test_a_thinned_map_is_that_of_the_window_in_larger_voxels(tmp_path):
     assert thin.window == cubes.window
     assert list(tmp_path.iterdir()) == folders
     np.testing.assert_array_equal(cubes.points(), points)
-
-
-def test_of_the_new_points_of_a_voxel_none_is_preferred_for_where_it_is():
-    """A wall lies where it was measured, in whichever order its points come."""
-    rng = np.random.default_rng(2)
-    wall = np.column_stack([20.0 + 0.02 * rng.normal(size=4000), rng.uniform(-4, 4, (4000, 2))])
-    nearest_first = wall[wall[:, 0].argsort()]
-    found = []
-    for points in (nearest_first, nearest_first[::-1]):
-        cubes = CubeMap(MapConfig(), 0.4)
-        cubes.insert(points, np.zeros(3))
-        found.append(cubes.points())
-    np.testing.assert_array_equal(*found)
-    assert len(found[0]) < 1000
-    assert abs(found[0][:, 0].mean() - wall[:, 0].mean()) < 3.0 * 0.02 / np.sqrt(len(found[0]))
-
-
-def test_of_the_new_points_of_a_voxel_one_of_the_lowest_owner_stays():
-    """As of sweeps that go into a map on trial together: the first to see a place."""
-    points = 3.0 + np.random.default_rng(3).uniform(0.0, 1e-3, (60, 3))
-    owners = np.arange(60)[::-1] // 20 + 4
-    cubes = CubeMap(MapConfig(), 0.4)
-    cubes.insert_sorted(cubes.sorted(CubePoints(points, tags_of(60, owners))))
-    assert cubes.count() == 1
-    assert cubes.points()[0] in points[40:]

@@ -15,8 +15,6 @@ from support.strategies import FEW, generators
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import OBLIQUE_EDGE, transform
-from loam_gtsam.voxels.cubes import CubePoints, chances_of
-from loam_gtsam.voxels.tags import tags_of
 
 Cell = tuple[int, int, int]
 Point = tuple[float, float, float]
@@ -29,11 +27,6 @@ EDGES = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]])
 def voxel_size(config: MapConfig) -> float:
     """That of voxels with edges of VOXEL."""
     return VOXEL / OBLIQUE_EDGE if config.insertion == "settled" else VOXEL
-
-
-def chance(point: Any) -> int:
-    """By which one of the new points of a voxel is chosen."""
-    return int(chances_of(CubePoints(point[None], tags_of(1, 0)))[0])
 
 
 class Reference:
@@ -65,7 +58,7 @@ class Reference:
         for (cube, voxel), group in new.items():
             held = self.cubes.setdefault(cube, {})
             if self.config.insertion == "settled":
-                held.setdefault(voxel, (min(group, key=chance), owner))
+                held.setdefault(voxel, (group[0], owner))
                 continue
             old, by = held.get(voxel, (None, owner))
             everything = group if old is None else [*group, old]

@@ -146,9 +146,8 @@ class MapConfig(Section):
     voxels of map and features and covariance.ground_cell have half their size, and lines and planes
     are fitted to twice as many neighbours; 0 keeps these values everywhere."""
     insertion: Literal["settled", "centroid"] = parameter("settled")
-    """New points enter a cube in this way: settled keeps the first point of a voxel, of several in
-    one sweep any, and one of each face of a thin wall; centroid filters the cube again with its new
-    points, as LOAM does."""
+    """New points enter a cube in this way: settled keeps the first point of a voxel, and one of
+    each face of a thin wall; centroid filters the cube again with its new points, as LOAM does."""
     insert_unmatched: bool = parameter(False)
     """A sweep with too few matches is inserted where it is expected, as by LOAM; else left out."""
     archive_megabytes: float = parameter(512.0, unit="MB", low=0.0)

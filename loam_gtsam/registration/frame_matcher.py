@@ -37,7 +37,7 @@ from loam_gtsam.registration.planes import match_wide_surfaces, translations_fix
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, SweepMotion
-from loam_gtsam.voxels.cubes import CubePoints, SortedPoints
+from loam_gtsam.voxels.cubes import CubePoints, SortedPoints, any_order
 from loam_gtsam.voxels.tags import look, tags_of
 
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
@@ -146,7 +146,10 @@ class MapPair:
     ) -> None:
         """Add a sweep as points of a keyframe; its last matches tell both sides of walls apart."""
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
-        faces = None if matches is None else matches.faces
+        edges, order = edges[any_order(len(edges))], any_order(len(planes))
+        planes, faces = planes[order], None if matches is None else matches.faces
+        if faces is not None:
+            faces = faces._replace(rows=order.argsort()[faces.rows])
         kept = (self._open, self._small)[: 1 + self.small]
         for edge_map, plane_map in kept:
             edge_map.owner = plane_map.owner = keyframe
@@ -241,7 +244,8 @@ def _owned(
     cubes: CubeMap, sweeps: Sequence[FloatArray], origins: FloatArray | None = None
 ) -> SortedPoints | None:
     """Points of sweeps, each owned by the number of its sweep, and seen from its origin."""
-    points, counts = np.concatenate(sweeps), [len(sweep) for sweep in sweeps]
+    counts = [len(sweep) for sweep in sweeps]
+    points = np.concatenate([sweep[any_order(len(sweep))] for sweep in sweeps])
     owners = np.arange(len(sweeps)).repeat(counts)
     tags = tags_of(len(points), owners)
     if origins is not None:

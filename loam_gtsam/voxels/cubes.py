@@ -21,8 +21,6 @@ _NO_KEYS: IntArray = np.empty(0, np.int64)
 _NO_TAGS = tags_of(0, 0)
 _SECOND = np.int64(-(1 << 63))
 """The sign bit: it is set in the keys of points that are second in their voxels."""
-_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-"""Odd numbers without a pattern: 2^64 over the golden ratio, and two primes of xxHash."""
 
 
 class CubePoints(NamedTuple):
@@ -163,18 +161,14 @@ def joined(parts: Sequence[CubePoints]) -> CubePoints:
     return CubePoints(*map(np.concatenate, zip(Cube().content, *parts, strict=True)))
 
 
-def chances_of(content: CubePoints) -> IntArray:
-    """Numbers (N,) by owner, and among the points of one by the digits of where they are.
+def any_order(count: int) -> IntArray:
+    """(N,) rows in an order by chance, in which of two rows the same always comes first.
 
-    The features of a sweep are sorted along an axis of the lidar. If the first of those in a voxel
-    stayed, it would always lie on the same side of their mean, and a wall that is made of such
-    points in front of where it is.
+    The features of a sweep are sorted along an axis of the lidar, and of those in a voxel the first
+    stays: it would always lie on the same side of their mean, and so would a wall that is made of
+    such points. See docs/maths/cubemap.md.
     """
-    x, y, z = np.ascontiguousarray(content.points, np.float64).view(np.uint64).T
-    mixed = x * _MIX[0] ^ y * _MIX[1] ^ z * _MIX[2]
-    owners = content.tags[:, 0].astype(np.int64) << 32
-    chances: IntArray = owners | (mixed >> np.uint64(32)).astype(np.int64)
-    return chances
+    return np.random.default_rng(0).random(count).argsort()
 
 
 def _order(keys: IntArray, numbers: IntArray) -> IntArray:
@@ -274,14 +268,10 @@ class SortedPoints(NamedTuple):
         return starts, dict(zip(map(cube_index, cubes), parts, strict=True))
 
     def firsts(self) -> dict[CubeIndex, VoxelPoints]:
-        """One point of each voxel, by cube: of the lowest owner, and there by chance."""
+        """The first point of each voxel, by cube."""
         starts, parts = self.voxels()
-        chances = chances_of(self.content)
-        least = np.minimum.reduceat(chances, starts)
-        chosen = np.flatnonzero(chances == least.repeat(np.diff(starts, append=len(chances))))
-        chosen = chosen[chosen.searchsorted(starts)]  # of points that are the same, one
-        keys, points = self.keys[starts], self.content.points.take(chosen, axis=0)
-        tags = self.content.tags.take(chosen, axis=0)
+        keys, points = self.keys[starts], self.content.points.take(starts, axis=0)
+        tags = self.content.tags.take(starts, axis=0)
         return {
             index: VoxelPoints(keys[part], points[part], tags[part])
             for index, part in parts.items()

@@ -28,7 +28,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.pipeline import effective_config
 from loam_gtsam.registration.association import associate
-from loam_gtsam.registration.degeneracy import localizability
+from loam_gtsam.registration.degeneracy import localizability, spanned
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers import MotionPrior, match_rows
@@ -248,9 +248,7 @@ def cosines(found: FloatArray, true: FloatArray, form: FloatArray) -> FloatArray
 
 def span(projector: FloatArray | None) -> FloatArray:
     """(W, 6) rows that span the range of a projector."""
-    if projector is None:
-        return np.zeros((0, 6))
-    return np.linalg.svd(projector)[0][:, : round(float(np.trace(projector)))].T
+    return np.zeros((0, 6)) if projector is None else spanned(projector).T
 
 
 def linear(matches: ScanMatches, guess: gtsam.Pose3, expected: gtsam.Pose3) -> Step:

@@ -94,8 +94,7 @@ class Localizability:
         ``shared`` is the number of matches over that of independent ones.
         """
         form, turns = self.displacement, self.displacement[:3, :3]
-        spanned, sizes, _ = np.linalg.svd(blind)
-        basis = spanned[:, sizes > _RANK * sizes[0]]
+        basis = spanned(blind)
         basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ form @ basis)).T
         basis = basis @ np.linalg.eigh(basis[:3].T @ turns @ basis[:3])[1]
         share = np.einsum("ik,ij,jk->k", basis[:3], turns, basis[:3])
@@ -199,6 +198,13 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
         directions[order], aligned[order], along[order],
         unit, by_planes[order], tilt, (told / of_noise)[order],
     )  # fmt: skip
+
+
+def spanned(projector: FloatArray) -> FloatArray:
+    """(6, W) orthonormal columns that span the motions that a (6, 6) projector leaves."""
+    columns, sizes, _ = np.linalg.svd(projector)
+    basis: FloatArray = columns[:, sizes > _RANK * sizes[0]]
+    return basis
 
 
 def tells_motion(seen: Localizability, config: SolverConfig) -> bool:

@@ -146,8 +146,8 @@ class MapPair:
     ) -> None:
         """Add a sweep as points of a keyframe; its last matches tell both sides of walls apart."""
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
-        edges, order = edges[any_order(len(edges))], any_order(len(planes))
-        planes, faces = planes[order], None if matches is None else matches.faces
+        order, faces = any_order(len(planes)), None if matches is None else matches.faces
+        edges, planes = edges[any_order(len(edges))], planes[order]
         if faces is not None:
             faces = faces._replace(rows=order.argsort()[faces.rows])
         kept = (self._open, self._small)[: 1 + self.small]

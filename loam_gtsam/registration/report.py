@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.registration.degeneracy import spanned
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import TANGENT, Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
 
@@ -120,17 +121,17 @@ def weak_directions_in_words(solution: Solution) -> str:
     One that is along no single axis is told by its parts, in metres and rad: ``x -0.31 y``.
     """
     assert solution.weak is not None
-    spanned = np.linalg.svd(solution.weak)[0][:, : solution.n_weak].T
-    for row in range(len(spanned)):  # each is to have an axis that the others have not
-        spanned[row:] = spanned[row:][np.argsort(-np.abs(spanned[row:]).max(axis=1), kind="stable")]
-        axis = int(np.abs(spanned[row]).argmax())
-        unit = spanned[row] / spanned[row, axis]
-        spanned = spanned - np.outer(spanned[:, axis], unit)
-        spanned[row] = unit
+    ways = spanned(solution.weak).T
+    for row in range(len(ways)):  # each is to have an axis that the others have not
+        ways[row:] = ways[row:][np.argsort(-np.abs(ways[row:]).max(axis=1), kind="stable")]
+        axis = int(np.abs(ways[row]).argmax())
+        unit = ways[row] / ways[row, axis]
+        ways = ways - np.outer(ways[:, axis], unit)
+        ways[row] = unit
     names = []
     # Positions first: these are asked for more often.
-    mains = np.abs(spanned).argmax(axis=1).tolist()
-    for main, unit in sorted(zip(mains, spanned, strict=True), key=lambda pair: (pair[0] + 3) % 6):
+    mains = np.abs(ways).argmax(axis=1).tolist()
+    for main, unit in sorted(zip(mains, ways, strict=True), key=lambda pair: (pair[0] + 3) % 6):
         parts = enumerate(zip(unit, TANGENT, strict=True))
         rest = [f" {v:+.2f} {axis}" for i, (v, axis) in parts if i != main and abs(v) > 0.05]
         names.append(TANGENT[main] + "".join(rest))

@@ -406,8 +406,8 @@ def test_a_lidar_that_turned_less_than_expected_has_not_moved_aside(method):
     assert solution.n_weak == 1
     assert abs(error[2]) < 0.004  # the scan sees that it has not turned
     assert abs(error[4]) < 0.005  # 0.02 rad times 7 m are 140 mm
-    share = np.linalg.solve(solution.information, solution.expected)
     if method == "gtsam":
+        share = np.linalg.solve(solution.information, solution.expected)
         assert np.abs(share - MotionPrior(guess, 1e4 * np.eye(6)).share(share)).max() < 1e-6
         assert np.linalg.norm(share @ np.eye(6)[2]) < 0.1  # of a turn, nothing along y
 

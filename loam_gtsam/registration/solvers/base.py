@@ -11,7 +11,7 @@ import numpy as np
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows
-from loam_gtsam.registration.degeneracy import Localizability
+from loam_gtsam.registration.degeneracy import Localizability, spanned
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.types import BoolArray, FloatArray, check_kind
 
@@ -23,7 +23,6 @@ SCAN_VARIANCE = 4.0
 does not tell it: where some direction is not seen, the map was made by the same guesses as the
 scan, and agrees with them."""
 
-_RANK = 1e-6  # singular value over the largest one, below which there is no direction
 _FAR = 1e4
 """Metres from its guess at which a pose is no solution: a sweep has no map there to match."""
 
@@ -194,8 +193,7 @@ class MotionPrior:
         """
         if self.measured or not self.information.any():
             return directions
-        spanned, sizes, _ = np.linalg.svd(directions)
-        basis = spanned[:, sizes > _RANK * sizes[0]]
+        basis = spanned(directions)
         pulled = basis.T @ self.information
         share: FloatArray = basis @ np.linalg.pinv(pulled @ basis, hermitian=True) @ pulled
         return share

@@ -361,6 +361,39 @@ def test_a_gyro_leaves_its_noise():
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
 
 
+def test_a_scan_that_a_gyro_has_turned_errs_with_the_turn_to_the_reference():
+    """What has moved the pose forth has turned the reference back."""
+    scan = ScanError(
+        1e-8 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0,
+        by_turns=-2e-10 * np.eye(6, 3),
+    )  # fmt: skip
+    errors, accelerations = FrameErrors(2e-4), Accelerations(10, np.zeros(6))
+    sweep, update = _Sweep(0, SweepMotion.GYRO), MapUpdate(0, gtsam.Pose3(), FrameStatus.OK)
+    own = errors.of(update, sweep, gtsam.Pose3(), scan, accelerations, None).covariance
+    np.testing.assert_allclose(np.diag(own)[:3], 1e-8 + 2e-4**2 * 0.05 - 4e-10, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("middle", "since"), [(0.05, -1.0), (0.0, 0.0), (-0.05, 1.0)])
+def test_where_the_gyro_alone_leads_its_noise_counts_from_one_reference_to_the_next(middle, since):
+    """No scan tells: so what it turned between a reference and a later middle does not matter."""
+    noise, known = 2e-4, 1e-8
+    scan = ScanError(np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    errors, accelerations = FrameErrors(noise), Accelerations(10, np.zeros(6))
+    turned, found = noise**2 * np.diag([0.1] * 3 + [0.0] * 6), []
+    for k in range(2):
+        sweep = _Sweep(k * FRAME, SweepMotion.GYRO)
+        sweep.middle = middle
+        update = MapUpdate(sweep.stamp, gtsam.Pose3(), FrameStatus.OK)
+        before = known * np.eye(9) + k * turned
+        fused = SimpleNamespace(covariance=before + turned, across=before)
+        found.append(errors.of(update, sweep, gtsam.Pose3(), scan, accelerations, fused))
+    first, second = found
+    own = known + noise**2 * (0.1 + since * 0.05)
+    np.testing.assert_allclose(np.diag(first.covariance)[:3], own, rtol=1e-9)
+    motion = first.covariance + second.covariance - second.shared - second.shared.T
+    np.testing.assert_allclose(np.diag(motion)[:3], noise**2 * 0.1 * (1 + max(since, 0)), rtol=1e-6)
+
+
 def test_a_gyro_that_turns_unlike_the_scans_bends_the_sweep_and_leads_elsewhere():
     more, none = np.array([0.04, 0.0, 0.0]), np.zeros((6, 6))
     args = {"across": 0.02, "turned": more}

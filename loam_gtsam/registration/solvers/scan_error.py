@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -28,6 +29,38 @@ _LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
 _LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
 
 
+class GyroNoise(NamedTuple):
+    """By which the attitude walks within a sweep, from its middle on, forth and back.
+
+    Attributes
+    ----------
+    density : rad/s/sqrt(Hz)
+    reference : seconds from the middle of the sweep to its reference time
+    """
+
+    density: float
+    reference: float
+
+    def scatter(self, jacobian: FloatArray, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What it makes of the scores of rows (R, 6) that are seen ``seconds`` after the middle.
+
+        Returns
+        -------
+        scatter, at_reference : (6, 6), and (6, 3) with the turn until the reference time
+        """
+        scatter, ahead = np.zeros((6, 6)), np.abs(seconds)
+        for times in (seconds, -seconds):  # each turn has turned all rows farther from the middle
+            last_first = np.argsort(-times, kind="stable")[: np.count_nonzero(times > 0.0)]
+            rows, times = jacobian[last_first], times[last_first]
+            turned = np.cumsum(rows[:, :, None] * rows[:, None, :3], axis=0)
+            turned *= np.sqrt(-np.diff(times, append=0.0))[:, None, None]
+            by_axis = turned.transpose(1, 0, 2).reshape(6, -1)
+            scatter += by_axis @ by_axis.T
+        common = np.minimum(ahead, abs(self.reference)) * (seconds * self.reference > 0.0)
+        at_reference = jacobian.T * common @ jacobian[:, :3]
+        return self.density**2 * scatter, self.density**2 * at_reference
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanError:
     """The error of one solved frame, from its matches; all about the middle of the sweep.
@@ -48,6 +81,8 @@ class ScanError:
         before, moves the pose, rad and m per metre
     offset : metres that they are too long, by the residuals of this scan
     offset_information : of that number, 1 / m^2, as far as it is none of scans before
+    by_turns : (6, 3) covariance of the pose with the rotation from the middle of the sweep to its
+        reference, as far as both stem from the noise of a gyro
     since_last : (6, 6) part of ``covariance`` that stems from factors since the last pose, along
         degenerate directions: the poses to come have it, too
     """
@@ -66,6 +101,7 @@ class ScanError:
     by_offset: FloatArray = field(default_factory=partial(np.zeros, 6))
     offset: float = 0.0
     offset_information: float = 0.0
+    by_turns: FloatArray = field(default_factory=partial(np.zeros, (6, 3)))
     since_last: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
 
     def seen(self, weak: FloatArray | None) -> FloatArray:
@@ -88,13 +124,13 @@ class ScanError:
         gains, axes = np.linalg.eigh(_through((turn * roots).T, self.information))
         gains = np.clip(gains, _LEAST_SHARE, 1.0)
         share = np.linalg.lstsq(self.covariance, self.renewed, rcond=None)[0]
-        frames = 1.0 / np.clip(np.trace(share) / 6.0, _LEAST_SHARE, 1.0)
-        left = 1.0 - gains
-        pulls = 1.0 - left * (1.0 - left**frames) / (frames * gains)
+        new = np.clip(np.trace(share) / 6.0, 0.0, 1.0)
+        lasts = 2.0 * new + gains * (1.0 - new)
+        pulls, strays = (1.0 + new) * gains / lasts, 2.0 * new / lasts
         out, back = turn * roots @ axes, axes.T @ (turn / roots).T
         pulled = _through(out * pulls @ back, self.renewed)
-        taken_over = _through(out * left @ back, self.renewed @ share)
-        return symmetric(factor * pulled + taken_over)
+        strayed = out * (gains * (1.0 - gains) * strays**2) @ out.T
+        return symmetric(factor * pulled + strayed)
 
     def with_factors(
         self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor],
@@ -122,7 +158,7 @@ class ScanError:
 def scan_error(
     solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
     *, kernel: str = "huber", with_priors: bool = True, seconds: FloatArray | None = None,
-    between: MotionPrior | None = None,
+    between: MotionPrior | None = None, gyro: GyroNoise | None = None,
 ) -> ScanError | None:  # fmt: skip
     """The error of one solved frame from its residuals; None if its information is singular.
 
@@ -142,6 +178,7 @@ def scan_error(
         plane; None if all are of one time
     between : what factors between the last pose and this one tell, which the solution counts among
         its priors; None without any
+    gyro : of what has turned the points within the sweep; None if no gyro has
     """
     pose, lines = solution.map_T_lidar, 2 * len(solution.matches.edges)
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
@@ -166,19 +203,19 @@ def scan_error(
     deviations = np.sqrt(_variances(residuals, jacobian, bread, lines))
     scaled = jacobian * deviations[:, None]
     scores = jacobian * residuals[:, None]
-    noise: FloatArray = scaled.T @ scaled
-    scale: FloatArray = np.linalg.inv(noise + priors).astype(np.float64, copy=False)
-    cells, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
-    scatter, fitted = _scatter(scores, scaled, scale, by_cell, len(cells))
-    # How much more the cells scatter than they would with independent residuals.
-    alone = max(float(np.trace(scale @ (noise - fitted))), 1.0)
-    alike = max(float(np.trace(scale @ scatter)) / alone, 1.0)
-    meat = scatter + alike * fitted
+    by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)[1]
     fresh = np.flatnonzero(new[by_ground])
-    scatter, fitted = _scatter(scores[fresh], scaled[fresh], scale, by_ground[fresh], len(new))
-    renewed = scatter + alike * fitted
+    meat, renewed, alike = _scores(scores, scaled, priors, by_cell, by_ground, fresh)
 
     scattered = _variance_and_matches(residuals, information, meat)
+    times = np.zeros(len(residuals)) if seconds is None else seconds
+    new_share = float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / 6.0
+    by_turns = np.zeros((6, 3))
+    if gyro is not None:
+        turned, at_reference = gyro.scatter(jacobian, times)
+        # None of it is an error of the map's points: (6) with f = 0.
+        meat, renewed = meat + turned, renewed + (2.0 * new_share / (1.0 + new_share)) ** 2 * turned
+        by_turns = -bread @ at_reference
     for_others = information / SCAN_VARIANCE
     if solution.weak is None:
         whole = meat + _STAYS * config.drift * renewed
@@ -188,7 +225,6 @@ def scan_error(
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
     shares = bread @ keep.T @ (priors - expected) @ keep, bread @ expected
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
-    times = np.zeros(len(residuals)) if seconds is None else seconds
     by_velocity, by_acceleration = (
         bread @ (jacobian.T * by @ jacobian) for by in (times, 0.5 * times**2)
     )
@@ -198,9 +234,9 @@ def scan_error(
     moved, offset, known = _offset(residuals, jacobian, bread, by_range, deviations)
     moved = moved + shares[1] @ back @ last
     seen.add(pose.AdjointMap() @ moved)
-    known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
-    ways = by_velocity, by_acceleration, moved
-    return ScanError(*found, *scattered, *ways, offset, known, _since_last(solution, between))
+    known *= new_share / alike
+    ways, since_last = (by_velocity, by_acceleration, moved), _since_last(solution, between)
+    return ScanError(*found, *scattered, *ways, offset, known, by_turns, since_last)
 
 
 def _since_last(solution: Solution, between: MotionPrior | None) -> FloatArray:
@@ -277,17 +313,46 @@ def _variances(
     return variances
 
 
+def _scores(
+    scores: FloatArray, scaled: FloatArray, priors: FloatArray,
+    by_cell: IntArray, by_ground: IntArray, fresh: IntArray,
+) -> tuple[FloatArray, FloatArray, float]:  # fmt: skip
+    """The scatter of all scores, (6, 6), and that of new ground.
+
+    Parameters
+    ----------
+    scores, scaled : (N, 6) scores, and rows of the Jacobian times the deviations of the residuals
+    priors : (6, 6) information beside the matches
+    by_cell, by_ground : (N,) numbers of the cells in which scores are summed, of all and of new
+    fresh : (F,) which of the N are of new ground
+
+    Returns
+    -------
+    meat, renewed : (6, 6)
+    alike : how much more the cells scatter than they would with independent residuals
+    """
+    noise: FloatArray = scaled.T @ scaled
+    scale: FloatArray = np.linalg.inv(noise + priors).astype(np.float64, copy=False)
+    scatter, fitted = _scatter(scores, scaled, scale, by_cell)
+    alone = max(float(np.trace(scale @ (noise - fitted))), 1.0)
+    alike = max(float(np.trace(scale @ scatter)) / alone, 1.0)
+    meat = scatter + alike * fitted
+    scatter, fitted = _scatter(scores[fresh], scaled[fresh], scale, by_ground[fresh])
+    return meat, scatter + alike * fitted, alike
+
+
 def _scatter(
-    scores: FloatArray, scaled: FloatArray, scale: FloatArray, cells: IntArray, count: int
+    scores: FloatArray, scaled: FloatArray, scale: FloatArray, cells: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """The scatter (6, 6) of the scores of cells, and what the fit has taken from it.
 
     Parameters
     ----------
-    scores, scaled : (N, 6) scores, and rows of the Jacobian times the deviations of the residuals
+    scores, scaled : (N, 6) as in :func:`_scores`
     scale : (6, 6) inverse of the scatter of all scores if residuals are independent
-    cells : (N,) numbers below ``count``
+    cells : (N,) numbers
     """
+    count = int(cells.max(initial=-1)) + 1
     row, column = np.triu_indices(6)
     axes = np.ascontiguousarray(scaled.T)
     halves = _sums((axes[row] * axes[column]).T, cells, count)

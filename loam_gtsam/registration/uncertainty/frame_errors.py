@@ -44,10 +44,10 @@ class _Middle:
     stamp: int  # nanoseconds of the middle
     map_T_lidar: gtsam.Pose3
     covariance: FloatArray  # (6, 6) of the scan's own error
-    with_own: FloatArray  # (6, 6) of that error with the frame's own at the reference time
+    with_own: FloatArray  # (6 or 9, 6) of that error, and of the velocity's, with the frame's own
     to_reference: FloatArray  # (6, 6) adjoint from the middle to there
     reference_stamp: int
-    of_state: FloatArray | None = None  # (6, 9) by which errors of pose and velocity get there
+    state: FloatArray | None = None  # (9, 9) covariance of pose and velocity, beside an IMU
 
 
 class FrameErrors:
@@ -100,7 +100,7 @@ class FrameErrors:
             if self._paused:
                 covariance = covariance + _changed(update.twist, sweep, motion.variances)
         else:
-            now, covariance, shared = self._by_imu(now, sweep, motion, fused, update)
+            now, covariance, shared = self._by_imu(now, sweep, motion, scan, fused, update)
         if turned is not None and last is not None and sweep.motion is SweepMotion.GYRO:
             covariance = covariance + _turned_unlike(turned, sweep, scan, now, last)
         self._last, self._paused, self._strayed = now, False, np.zeros(6)
@@ -126,11 +126,13 @@ class FrameErrors:
         if last is not None:
             across = share[:, None] * now.map_T_lidar.between(last.map_T_lidar).AdjointMap()
             covariance = covariance + across @ last.covariance @ across.T
-            shared = to_reference @ across @ last.with_own
+            shared = to_reference @ across @ last.with_own[:6]
         strayed = share * self._strayed
         covariance = covariance + self._missed(sweep, motion, scan) + np.outer(strayed, strayed)
-        covariance = to_reference @ covariance @ to_reference.T
-        with_own = (now.covariance * kept) @ to_reference.T
+        with_turn = np.column_stack([scan.by_turns, np.zeros((6, 3))])
+        crossed = kept[:, None] * with_turn
+        covariance = to_reference @ (covariance + crossed + crossed.T) @ to_reference.T
+        with_own = (now.covariance * kept + with_turn) @ to_reference.T
         return replace(now, with_own=with_own), covariance, shared
 
     def _by_imu(
@@ -138,6 +140,7 @@ class FrameErrors:
         now: _Middle,
         sweep: MovingSweep,
         motion: Accelerations,
+        scan: ScanError,
         fused: Fused,
         update: MapUpdate,
     ) -> tuple[_Middle, FloatArray, FloatArray]:
@@ -145,17 +148,31 @@ class FrameErrors:
         last, to_reference = self._last, now.to_reference
         back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
         of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
-        turned = np.zeros((6, 6))
-        turned[:3, :3] = self._missed(sweep, motion)[:3, :3]
-        covariance = of_state @ fused.covariance @ of_state.T + turned
+        turned, state = self._missed(sweep, motion), fused.covariance
+        turned[3:] = turned[:, 3:] = 0.0
+        with_turn = np.zeros((9, 6))
+        with_turn[:, :3] = self._with_turn(sweep, scan, state) @ to_reference[:3, :3].T
+        crossed = of_state @ with_turn
+        covariance = of_state @ state @ of_state.T + turned + crossed + crossed.T
+        with_own = state @ of_state.T + with_turn
         shared = np.zeros((6, 6))
-        if last is not None and last.of_state is not None:
-            shared = of_state @ fused.across @ last.of_state.T
-        with_own = fused.covariance[:6] @ of_state.T
-        now = replace(
-            now, covariance=fused.covariance[:6, :6], with_own=with_own, of_state=of_state
-        )
+        if last is not None and last.state is not None:
+            before = np.linalg.lstsq(last.state, last.with_own, rcond=None)[0]
+            shared = of_state @ fused.across @ before
+        now = replace(now, covariance=state[:6, :6], with_own=with_own, state=state)
         return now, covariance, shared
+
+    def _with_turn(self, sweep: MovingSweep, scan: ScanError, state: FloatArray) -> FloatArray:
+        """(9, 3) covariance of pose and velocity with the turn from there to the reference.
+
+        The gyro has also led to the middle: so far, what it turned since the reference cancels.
+        """
+        if sweep.motion is not SweepMotion.GYRO:
+            return np.zeros((9, 3))
+        gain = state[:, :6] @ scan.information
+        left = np.eye(9, 3) - gain[:, :3]
+        with_turn = gain @ scan.by_turns - self._gyro_noise**2 * max(sweep.middle, 0.0) * left
+        return np.asarray(with_turn)
 
     def _missed(
         self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None

@@ -21,7 +21,7 @@ from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seco
 from loam_gtsam.registration.relocalization import Gap, same, spread_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
-from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.scan_error import GyroNoise, ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
 from loam_gtsam.registration.uncertainty.frame_errors import FrameErrors
@@ -32,6 +32,7 @@ from loam_gtsam.types import (
     FrameStatus,
     InputError,
     MapUpdate,
+    SweepMotion,
     Uncertainty,
     check_kind,
 )
@@ -103,7 +104,8 @@ class PoseErrors:
         self._with_priors = graph
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
-        self._map, self._frames = MapError(config), FrameErrors(config.imu.gyro_noise)
+        self._gyro_noise = config.imu.gyro_noise
+        self._map, self._frames = MapError(config), FrameErrors(self._gyro_noise)
         self.beam_errors = BeamErrors(config)
         self._found: MapUpdate | None = None  # the last update of a sweep that was found
 
@@ -147,11 +149,12 @@ class PoseErrors:
             points = transform(solution.map_T_lidar.matrix(), rows.points)
             facing, last = facings(rows.normals, lines), max(seen.scans - 1, 0)
             seen.cells(points, facing, config.ground_cell, new=last)
-        self._small = small
+        self._small, by_gyro = small, sweep.motion is SweepMotion.GYRO
         return scan_error(
             solution, self._kernel_width, seen, config, kernel=self._kernel,
             with_priors=self._with_priors, seconds=row_seconds(solution.matches, sweep),
             between=between,
+            gyro=GyroNoise(self._gyro_noise, -sweep.middle) if by_gyro else None,
         )  # fmt: skip
 
     def calibrated(

@@ -15,6 +15,8 @@ _LONGER = 1.5  # times the time between two sweeps for which accelerations are k
 _LATER = 2.0 / 3.0
 """Of the time between two sweeps, by which the acceleration that sets the velocity in the middle of
 the new one is later than the second difference of the poses, which is that in the last middle."""
+_SLOWEST = 1e-3  # sine, of a frequency that no window shows
+_SHORTEST = 1e-3  # least seconds between the middles of two sweeps
 _KNOWN = 3  # accelerations from which their mean is believed
 
 
@@ -28,7 +30,8 @@ class Expected:
     velocity : (6,) rad/s and m/s, body velocity between the middles of the last two sweeps
     share : (6,) by axis; none where accelerations do not last
     most : (6,) rad/s^2 and m/s^2, to which the last one is limited: the pose may have jumped
-    variances : (6,) (rad/s^2)^2 and (m/s^2)^2, of what is not expected
+    variances : (6,) (rad/s^2)^2 and (m/s^2)^2, of what is not expected, as far as it can be
+        believed: a jump of the pose is no acceleration
     """
 
     stamp: int
@@ -79,7 +82,8 @@ class Accelerations:
         usual, latest = self.variances, self._latest[0]
         if not steady:
             usual, latest = self._unexpected, self._latest[1]
-        return np.where(latest > _BEGUN**2 * usual, latest, usual * (1.0 if steady else _LATER**2))
+        begun, later = latest > _BEGUN**2 * usual, 1.0 if steady else _LATER**2
+        return np.where(begun, latest, later * self._faster**4 * usual)
 
     @property
     def at_first(self) -> FloatArray:
@@ -96,7 +100,8 @@ class Accelerations:
         """What is expected of the next acceleration; None at first."""
         if not self.known or self._last is None:
             return None
-        return Expected(*self._last, self._share, _USUAL * np.sqrt(self._raw), self._unexpected)
+        variances = np.minimum(self._faster**4 * self._unexpected, self._expected)
+        return Expected(*self._last, self._share, _USUAL * np.sqrt(self._raw), variances)
 
     @property
     def _share(self) -> FloatArray:
@@ -114,6 +119,32 @@ class Accelerations:
         """(6,) mean squares of what is not expected."""
         unexpected: FloatArray = np.maximum(self.variances - self._share**2 * self._raw, 0.0)
         return unexpected
+
+    @property
+    def jerks(self) -> FloatArray:
+        """(6,) (rad/s^3)^2 and (m/s^3)^2, mean squares."""
+        return self._changes * self._faster**6 / max(self._period, _SHORTEST) ** 2
+
+    @property
+    def _changes(self) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2, mean squares of the change of the acceleration."""
+        # A third difference has the errors of four poses, with weights 1, -3, 3, -1.
+        noise = 20.0 / 6.0 * (self._raw - self._mean)
+        return np.maximum(2.0 * (self._raw - self._lasting) - noise, 0.0)
+
+    @property
+    def _faster(self) -> FloatArray:
+        """(6,) the root of by how much accelerations exceed second differences of the poses.
+
+        As for a sine whose third differences are as these: that of the frequency f over the period
+        T has 2 sin(pi f T) times the second ones, and these have (sin(pi f T) / pi f T)^2 of the
+        acceleration.
+        """
+        if not self.known:
+            return np.ones(6)
+        ratio = self._changes / np.maximum(self._mean, np.finfo(float).tiny)
+        sine = np.clip(0.5 * np.sqrt(ratio), _SLOWEST, 1.0)
+        return np.arcsin(sine) / sine
 
     def explains(self, step: FloatArray, stamp: int) -> bool:
         """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.

@@ -26,16 +26,11 @@ from loam_gtsam.registration.matches import (
     joined,
     trial_matching,
 )
-from loam_gtsam.registration.odometry import (
-    Moment,
-    Prediction,
-    solved_twist,
-    timed_rows,
-    twist_to,
-)
+from loam_gtsam.registration.odometry import Moment, Prediction, twist_to
 from loam_gtsam.registration.planes import match_wide_surfaces, translations_fixed
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
+from loam_gtsam.registration.solvers.sweep_velocity import solved_twist, timed_rows
 from loam_gtsam.types import FloatArray, SweepMotion
 from loam_gtsam.voxels.cubes import CubePoints, SortedPoints, any_order
 from loam_gtsam.voxels.tags import look, tags_of
@@ -383,10 +378,7 @@ class FrameMatcher(Matcher):
         rows, seconds = timed_rows(matches, sweep, config.solver)
         # A change of the velocity is one of the acceleration: the last middle stays on the path.
         seconds = seconds + seconds**2 / span
-        # A jump of the pose is no acceleration to believe in.
-        most = np.repeat([config.solver.turn_sigma, config.solver.acceleration_sigma], 3)
-        unexpected = np.minimum(np.sqrt(self.accelerations.variances), most)
-        missed = 0.5 * self.last.seconds_to(sweep.stamp) * unexpected
+        missed = 0.5 * self.last.seconds_to(sweep.stamp) * np.sqrt(self.accelerations.variances)
         twist, noise = matches.search.posed.twist, config.features.range_noise
         return solved_twist(
             rows, matches.tilts, seconds, map_T_lidar, twist, expected, missed, noise

@@ -13,8 +13,8 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.degeneracy import tells_motion
-from loam_gtsam.registration.odometry import timed_rows, unseen_velocity
 from loam_gtsam.registration.solvers import Solution
+from loam_gtsam.registration.solvers.sweep_velocity import timed_rows, unseen_velocity
 
 _LEAST = 1.0
 """Information of a sweep about the share of the motion below which it tells nothing."""

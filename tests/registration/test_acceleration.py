@@ -48,6 +48,17 @@ def test_a_sway_is_expected_to_go_on_in_part():
     assert known.next.variances[3] < 0.5 * known.variances[3]
 
 
+@pytest.mark.parametrize("hertz", [1.0, 1.5, 2.5, 3.5])
+def test_accelerations_of_a_fast_sway_are_larger_than_second_differences(hertz):
+    """Its poses are taken ten times a second."""
+    rate, drive = 2.0 * np.pi * hertz, along(3, lambda t: 0.02 * np.sin(2.0 * np.pi * hertz * t))
+    known = of_path(drive)[0]
+    assert known.missed(steady=True)[3] == pytest.approx((0.02 * rate**2) ** 2 / 2.0, rel=0.35)
+    assert known.jerks[3] == pytest.approx((0.02 * rate**3) ** 2 / 2.0, rel=0.5)
+    shown = (np.sin(0.05 * rate) / (0.05 * rate)) ** 4
+    assert known.variances[3] / known.missed(steady=True)[3] == pytest.approx(shown, rel=0.2)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_of_noise_nothing_is_expected(seed):
     known, _ = of_path(lambda _: np.zeros(6), sigma=0.01, seed=seed)

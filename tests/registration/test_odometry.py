@@ -7,16 +7,13 @@ import gtsam
 import numpy as np
 import pytest
 from support.matches import difference
-from support.quick import begin_quickly
 
 from loam_gtsam.config import Config, OdometryConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import move_points
 from loam_gtsam.imu.preintegration import InertialPrediction
-from loam_gtsam.pipeline import run
 from loam_gtsam.registration.odometry import (
     ConstantVelocity,
     Moment,
@@ -25,9 +22,7 @@ from loam_gtsam.registration.odometry import (
     advance,
     make_odometry,
     predict,
-    solved_twist,
 )
-from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Features, FrameStatus, MapUpdate
 
 STAMP = 1_700_000_000_000_000_000
@@ -373,98 +368,3 @@ def test_no_points_or_queries_give_no_matches():
         assert (len(index), centres.shape, directions.shape) == (0, (0, 3), (0, 3))
         index, normals, offsets = search.planes(asked, 1.0, 2)
         assert (len(index), normals.shape, offsets.shape) == (0, (0, 3), (0,))
-
-
-# -- the motion within a sweep ---------------------------------------------------------------
-
-WIDE, TIGHT = np.full(6, 100.0), np.full(6, 1e-3)
-
-
-def exact(rows):
-    """Normals without noise."""
-    return np.zeros(len(rows.points))
-
-
-def sweep_of_walls(twist, assumed, seconds=None, count=3000, scale=50.0):
-    """Matches of a sweep that moved with a twist and was de-skewed with another one."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-10.0, 10.0, (count, 3))
-    seconds = rng.uniform(-0.05, 0.05, count) if seconds is None else np.full(count, seconds)
-    normals = rng.standard_normal((count, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    offsets = -np.einsum("ij,ij->i", normals, START.transformFrom(points.T).T)
-    seen = move_points(move_points(points, -twist, seconds), assumed, seconds)
-    return MatchRows(seen, normals, offsets, np.full(count, scale)), seconds
-
-
-def test_the_motion_within_a_sweep_is_found_from_its_matches():
-    assumed = TWIST + np.array([0.1, -0.2, 0.1, 1.0, 0.5, -0.5])
-    rows, seconds = sweep_of_walls(TWIST, assumed)
-    found = solved_twist(rows, exact(rows), seconds, START, assumed, assumed, WIDE, 0.0)
-    # One linear step, against an error of a metre per second.
-    np.testing.assert_allclose(found, TWIST, atol=0.02)
-    rows, seconds = sweep_of_walls(TWIST, found)
-    again = solved_twist(rows, exact(rows), seconds, START, found, assumed, WIDE, 0.0)
-    np.testing.assert_allclose(again, TWIST, atol=1e-3)
-
-
-def test_a_mean_velocity_that_is_known_better_stays():
-    rows, seconds = sweep_of_walls(TWIST, TWIST, scale=1.0)
-    mean = TWIST + 0.05
-    found = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, TIGHT, 0.02)
-    np.testing.assert_allclose(found, mean, atol=2e-3)
-
-
-def test_what_the_pose_explains_as_well_is_no_motion():
-    """All points of the sweep at one moment: the scan fits at another pose or another velocity."""
-    rows, seconds = sweep_of_walls(TWIST, TWIST + 0.2, seconds=0.03)
-    mean = TWIST + 0.1
-    found = solved_twist(rows, exact(rows), seconds, START, TWIST + 0.2, mean, np.ones(6), 0.0)
-    np.testing.assert_allclose(found, mean, atol=1e-6)
-
-
-def test_what_the_noise_of_the_normals_makes_is_no_information():
-    """Ground alone: a turn moves its points along it, and only false normals see that."""
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-30.0, 30.0, (2000, 2)), np.full(2000, -1.5)])
-    seconds, tilts = rng.uniform(-0.05, 0.05, 2000), np.full(2000, 0.07)
-    normals = np.column_stack([0.05 * rng.standard_normal((2000, 2)), np.ones(2000)])
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    offsets = -np.einsum("ij,ij->i", normals, points) + 0.03 * rng.standard_normal(2000)
-    rows = MatchRows(points, normals, offsets, np.full(2000, 30.0))
-    mean, missed = np.array([0.0, 0.0, 0.3, 5.0, 0.0, 0.0]), np.full(6, 0.3)
-    still = rows, seconds, gtsam.Pose3(), np.zeros(6), mean, missed, 0.0
-    noisy = solved_twist(still[0], tilts, *still[1:])
-    np.testing.assert_allclose(noisy[[2, 3]], [0.3, 5.0], rtol=0.05)
-    believed = solved_twist(still[0], exact(rows), *still[1:])
-    assert believed[2] < 0.1
-
-
-@pytest.mark.parametrize("count", [2, 5])
-def test_a_few_matches_leave_the_mean_velocity(count):
-    rows, seconds = sweep_of_walls(TWIST, TWIST + 0.2, count=count)
-    found = solved_twist(
-        rows, exact(rows), seconds, START, TWIST + 0.2, TWIST, np.full(6, 0.1), 0.02
-    )
-    np.testing.assert_allclose(found, TWIST, atol=1e-6)
-
-
-def test_matches_are_believed_up_to_the_error_of_one_side_of_the_sensor():
-    """Half of 2 cm over half a sweep: 0.2 m/s, beside a mean velocity that is as uncertain."""
-    rows, seconds = sweep_of_walls(TWIST, TWIST, scale=1e4)
-    mean, missed = TWIST + 0.1 * np.eye(6)[3], np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2])
-    found = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.02)
-    assert found[3] - TWIST[3] == pytest.approx(0.05, rel=0.02)
-    even = solved_twist(rows, exact(rows), seconds, START, TWIST, mean, missed, 0.0)
-    assert even[3] - TWIST[3] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_where_it_shakes_a_solved_motion_halves_the_error(monkeypatch):
-    begin_quickly(monkeypatch)
-    world = SimulatedWorld("shaken", frames=35, columns=300)
-
-    def error(model):
-        result = run(world, Config().changed({"deskew.model": model, "imu.coupling": "off"}))
-        return absolute_error(result.trajectory, world.truth).rmse
-
-    assert error("linear") < 0.6 * error("constant")

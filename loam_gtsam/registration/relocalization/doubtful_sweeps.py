@@ -13,7 +13,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.imu_tracker import ImuTracker
-from loam_gtsam.registration.odometry import advance, predict, solved_twist, timed_rows
+from loam_gtsam.registration.odometry import advance, predict
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AGREE,
@@ -36,6 +36,7 @@ from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import ScanSolver, Solution
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
 from loam_gtsam.registration.solvers.own_factors import NamedSolver
+from loam_gtsam.registration.solvers.sweep_velocity import solved_twist, timed_rows
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, SweepMotion
 
 _CLOSER = 3  # largest number of places that are looked at closer

@@ -75,8 +75,10 @@ class ScanError:
     information : (6, 6) of the scan alone, for other factors; none along degenerate directions
     step : (6,) from the solved pose to the optimum of the scan alone
     residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
-    by_velocity, by_acceleration : (6, 6) s and s^2, by which a velocity and an acceleration in the
-        middle of the sweep that its points were not de-skewed for move the pose
+    by_velocity, by_acceleration, by_jerk : (6, 6) s, s^2 and s^3, by which a velocity, an
+        acceleration and its change in the middle of the sweep that its points were not de-skewed
+        for move the pose
+    of_velocity : (6, 6) information of the matches on that velocity, as far as they have told it
     by_offset : (6,) how far each metre that all ranges are too long, of this scan and of those
         before, moves the pose, rad and m per metre
     offset : metres that they are too long, by the residuals of this scan
@@ -98,6 +100,8 @@ class ScanError:
     effective_matches: float
     by_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
     by_acceleration: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
+    by_jerk: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
+    of_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
     by_offset: FloatArray = field(default_factory=partial(np.zeros, 6))
     offset: float = 0.0
     offset_information: float = 0.0
@@ -225,9 +229,6 @@ def scan_error(
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
     shares = bread @ keep.T @ (priors - expected) @ keep, bread @ expected
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
-    by_velocity, by_acceleration = (
-        bread @ (jacobian.T * by @ jacobian) for by in (times, 0.5 * times**2)
-    )
     back, last = pose.inverse().AdjointMap(), seen.moved(np.array([seen.scans]))[0]
     follows = np.einsum("ni,ni->n", jacobian @ back, seen.moved(since)[by_ground])
     by_range = _by_range(solution.matches, rows) - follows
@@ -235,8 +236,23 @@ def scan_error(
     moved = moved + shares[1] @ back @ last
     seen.add(pose.AdjointMap() @ moved)
     known *= new_share / alike
-    ways, since_last = (by_velocity, by_acceleration, moved), _since_last(solution, between)
-    return ScanError(*found, *scattered, *ways, offset, known, by_turns, since_last)
+    return ScanError(
+        *found, *scattered, *_by_motion(bread, jacobian, times),
+        by_offset=moved, offset=offset, offset_information=known, by_turns=by_turns,
+        since_last=_since_last(solution, between),
+    )  # fmt: skip
+
+
+def _by_motion(
+    bread: FloatArray, jacobian: FloatArray, seconds: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``by_velocity``, ``by_acceleration`` and ``by_jerk`` of a :class:`ScanError`."""
+
+    def by(moved: FloatArray) -> FloatArray:
+        drawn: FloatArray = bread @ (jacobian.T * moved @ jacobian)
+        return drawn
+
+    return by(seconds), by(seconds**2 / 2.0), by(seconds**3 / 6.0)
 
 
 def _since_last(solution: Solution, between: MotionPrior | None) -> FloatArray:

@@ -11,8 +11,8 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.registration.degeneracy import tells_motion
-from loam_gtsam.registration.odometry import solved_twist, timed_rows
 from loam_gtsam.registration.solvers import Solution
+from loam_gtsam.registration.solvers.sweep_velocity import solved_twist, timed_rows
 from loam_gtsam.registration.start.ways import EarlySweep, mean_twist
 from loam_gtsam.types import FloatArray, SweepMotion
 

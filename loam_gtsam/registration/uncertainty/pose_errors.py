@@ -17,12 +17,14 @@ from loam_gtsam.geometry import symmetric, transform
 from loam_gtsam.imu.coupling import OtherPose
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
-from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
+from loam_gtsam.registration.degeneracy import tells_motion
+from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import Gap, same, spread_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import GyroNoise, ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
+from loam_gtsam.registration.solvers.sweep_velocity import ToldVelocity, row_seconds, timed_rows
 from loam_gtsam.registration.uncertainty.beam_errors import BeamErrors
 from loam_gtsam.registration.uncertainty.frame_errors import FrameErrors
 from loam_gtsam.registration.uncertainty.map_error import MapError
@@ -104,7 +106,7 @@ class PoseErrors:
         self._with_priors = graph
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
-        self._gyro_noise = config.imu.gyro_noise
+        self._config, self._gyro_noise = config, config.imu.gyro_noise
         self._map, self._frames = MapError(config), FrameErrors(self._gyro_noise)
         self.beam_errors = BeamErrors(config)
         self._found: MapUpdate | None = None  # the last update of a sweep that was found
@@ -150,12 +152,29 @@ class PoseErrors:
             facing, last = facings(rows.normals, lines), max(seen.scans - 1, 0)
             seen.cells(points, facing, config.ground_cell, new=last)
         self._small, by_gyro = small, sweep.motion is SweepMotion.GYRO
-        return scan_error(
+        error = scan_error(
             solution, self._kernel_width, seen, config, kernel=self._kernel,
             with_priors=self._with_priors, seconds=row_seconds(solution.matches, sweep),
             between=between,
             gyro=GyroNoise(self._gyro_noise, -sweep.middle) if by_gyro else None,
         )  # fmt: skip
+        return error and replace(error, of_velocity=self._of_velocity(solution, sweep))
+
+    def _of_velocity(self, solution: Solution, sweep: MovingSweep) -> FloatArray:
+        """(6, 6) information of the matches on the velocity in the middle of a sweep.
+
+        None if they had no say in it.
+        """
+        last, seen, config = self._frames.last, solution.localizability, self._config
+        had_a_say = sweep.acceleration is not None and seen and tells_motion(seen, config.solver)
+        if last is None or sweep.stamp <= last[0] or not had_a_say:
+            return np.zeros((6, 6))
+        rows, seconds = timed_rows(solution.matches, sweep, config.solver)
+        span = max((sweep.stamp - last[0]) * 1e-9, sweep.duration)
+        seconds = seconds + seconds**2 / span  # the last middle stays on the path
+        tilts, noise = solution.matches.tilts, config.features.range_noise
+        told = ToldVelocity.of(rows, tilts, seconds, solution.map_T_lidar, noise)
+        return told.information
 
     def calibrated(
         self,

@@ -376,12 +376,10 @@ class FrameMatcher(Matcher):
         assert matches.search is not None
         config, sweep = self.config, self.posed.sweep
         rows, seconds = timed_rows(matches, sweep, config.solver)
-        # A change of the velocity is one of the acceleration: the last middle stays on the path.
-        seconds = seconds + seconds**2 / span
         missed = 0.5 * self.last.seconds_to(sweep.stamp) * np.sqrt(self.accelerations.variances)
         twist, noise = matches.search.posed.twist, config.features.range_noise
         return solved_twist(
-            rows, matches.tilts, seconds, map_T_lidar, twist, expected, missed, noise
+            rows, matches.tilts, seconds, map_T_lidar, twist, expected, missed, noise, span=span
         )
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:

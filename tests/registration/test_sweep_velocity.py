@@ -1,5 +1,7 @@
 """The velocity within a sweep: told by matches that are exact, few, noisy, or of one moment."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.geometry import move_points
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration.solvers.sweep_velocity import solved_twist
+from loam_gtsam.registration.solvers.sweep_velocity import ToldVelocity, solved_twist
 from loam_gtsam.studies.evaluation import absolute_error
 
 START = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
@@ -106,3 +108,31 @@ def test_where_it_shakes_a_solved_motion_halves_the_error(monkeypatch):
         return absolute_error(result.trajectory, world.truth).rmse
 
     assert error("linear") < 0.6 * error("constant")
+
+
+def test_a_velocity_that_was_expected_and_told_has_the_error_of_both():
+    rng, trials = np.random.default_rng(0), 20000
+    variances = np.array([0.01, 0.04, 0.01, 0.02, 0.01, 0.09])
+    root = rng.normal(size=(6, 6))
+    information, believed = root @ root.T + np.eye(6), np.diag(rng.uniform(5.0, 200.0, 6))
+    expected = np.sqrt(variances) * rng.normal(size=(trials, 6))
+    seen = rng.multivariate_normal(np.zeros(6), np.linalg.inv(information), trials)
+    solved = np.linalg.solve(believed + information, believed @ expected.T + information @ seen.T)
+    told = ToldVelocity(np.zeros(6), information, np.zeros((6, 6)))
+    left = told.left(np.diag(variances), believed)
+    np.testing.assert_allclose(solved @ solved.T / trials, left, atol=0.05 * np.abs(left).max())
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_jerk_changes_the_velocity_that_matches_tell(axis):
+    jerk, span = 2.0 * np.eye(6)[axis], 0.1
+    rows, seconds = sweep_of_walls(np.zeros(6), np.zeros(6))
+    still = ToldVelocity.of(rows, exact(rows), seconds, START, 0.0, span)
+    curve = (seconds**3 + span * seconds**2) / 6.0
+    bent = replace(rows, points=move_points(rows.points, -jerk, curve))
+    told = ToldVelocity.of(bent, exact(rows), seconds, START, 0.0, span)
+    np.testing.assert_allclose(told.step - still.step, still.by_jerk @ jerk, atol=1e-5)
+    # Over all points, the part of the curve that goes along with the velocity's
+    alike = (1.0 / 80.0 + 1.0 / 180.0) / 6.0 / (1.0 / 12.0 + 1.0 / 180.0)
+    assert told.step[axis] == pytest.approx(alike * span**2 * jerk[axis], rel=0.1)
+    assert not ToldVelocity.of(rows, exact(rows), seconds, START, 0.0).by_jerk.any()

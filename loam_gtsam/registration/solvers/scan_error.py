@@ -17,6 +17,7 @@ from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE, MotionPrior, Solution, linearized
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
+from loam_gtsam.registration.solvers.sweep_velocity import ToldVelocity
 from loam_gtsam.types import FloatArray, IntArray
 
 _TOLD = 6.0
@@ -78,7 +79,7 @@ class ScanError:
     by_velocity, by_acceleration, by_jerk : (6, 6) s, s^2 and s^3, by which a velocity, an
         acceleration and its change in the middle of the sweep that its points were not de-skewed
         for move the pose
-    of_velocity : (6, 6) information of the matches on that velocity, as far as they have told it
+    told : what the matches have told of that velocity; None if they had no say in it
     by_offset : (6,) how far each metre that all ranges are too long, of this scan and of those
         before, moves the pose, rad and m per metre
     offset : metres that they are too long, by the residuals of this scan
@@ -101,7 +102,7 @@ class ScanError:
     by_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
     by_acceleration: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
     by_jerk: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
-    of_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
+    told: ToldVelocity | None = None
     by_offset: FloatArray = field(default_factory=partial(np.zeros, 6))
     offset: float = 0.0
     offset_information: float = 0.0

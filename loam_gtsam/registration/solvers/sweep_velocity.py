@@ -45,22 +45,25 @@ class ToldVelocity(NamedTuple):
     ----------
     step : (6,) rad/s and m/s, the change of the velocity that they want
     information : (6, 6) of it, as far as it can be believed
+    by_jerk : (6, 6) s^2, by which a jerk changes that step
     """
 
     step: FloatArray
     information: FloatArray
+    by_jerk: FloatArray
 
     @classmethod
     def of(
         cls, rows: MatchRows, tilts: FloatArray, seconds: FloatArray, map_T_middle: gtsam.Pose3,
-        range_noise: float,
+        range_noise: float, span: float = np.inf,
     ) -> ToldVelocity:  # fmt: skip
         """Of the matches of a sweep at a pose.
 
         A change of the velocity moves a point that was measured s seconds from the middle s times
-        as far as the same change of the pose. What a change of the pose explains as well is left
-        out, and so is the information that the noise of the normals makes. Ranges that are wrong
-        on one side of the sensor look like a motion, which limits the rest.
+        as far as the same change of the pose, or s + s^2 / span times where the path is a parabola
+        through the last middle. What a change of the pose explains as well is left out, and so is
+        the information that the noise of the normals makes. Ranges that are wrong on one side of
+        the sensor look like a motion, which limits the rest.
 
         Parameters
         ----------
@@ -69,40 +72,62 @@ class ToldVelocity(NamedTuple):
         seconds : (R,) from the middle of the sweep
         map_T_middle : the solved pose
         range_noise : metres, of a single range
+        span : seconds since the last middle; infinite if it is not on the path
         """
         residuals, by_pose = rows.residuals(map_T_middle)
-        both = np.hstack([by_pose, by_pose * seconds[:, None]])
+        moved = seconds + seconds**2 / span
+        both = np.hstack([by_pose, by_pose * moved[:, None]])
         information, pull = both.T @ both, -(both.T @ residuals)
         of_pose, across = information[:6, :6], information[6:, :6]
         followed = across @ np.linalg.pinv(of_pose, rcond=_RANK, hermitian=True)
         information = information[6:, 6:] - followed @ across.T
         alone = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
         step = alone @ (pull[6:] - followed @ pull[:6])
-        noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
+        by_jerk = np.zeros((6, 6))
+        if np.isfinite(span):
+            bent = both.T @ (by_pose * ((seconds + span) * seconds**2 / 6.0)[:, None])
+            by_jerk = alone @ (bent[6:] - followed @ bent[:6])
+        noise = displacements(rows.points, (rows.scales * tilts * moved) ** 2)
         information = nearest_positive(information - noise)
-        wrong = unseen_velocity(seconds, range_noise)
+        wrong = unseen_velocity(moved, range_noise)
         far = float(np.median(np.sqrt(squared_norm(rows.points.T))))
         limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
-        return cls(step, parallel_sum(limit, information))
+        return cls(step, parallel_sum(limit, information), by_jerk)
+
+    def left(self, missed: FloatArray, believed: FloatArray) -> FloatArray:
+        """(6, 6) covariance of the velocity by the matches and the expected one.
+
+        That misses it by the covariance ``missed`` (6, 6), and was believed by the information
+        ``believed`` (6, 6).
+        """
+        both = np.linalg.inv(believed + self.information)
+        kept = both @ believed
+        left: FloatArray = kept @ missed @ kept.T + both @ self.information @ both
+        return left
+
+    def bent(self, believed: FloatArray) -> FloatArray:
+        """(6, 6) s^2, by which a jerk changes that velocity."""
+        both, alone = believed + self.information, self.information @ self.by_jerk
+        return np.asarray(np.linalg.solve(both, alone), np.float64)
 
 
 def solved_twist(
     rows: MatchRows, tilts: FloatArray, seconds: FloatArray, map_T_middle: gtsam.Pose3,
     twist: FloatArray, mean: FloatArray, missed: FloatArray, range_noise: float,
-    *, heed_contradiction: bool = False,
+    *, span: float = np.inf, heed_contradiction: bool = False,
 ) -> FloatArray:  # fmt: skip
     """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
 
     Parameters
     ----------
-    rows, tilts, seconds, map_T_middle, range_noise : as for :meth:`ToldVelocity.of`
+    rows, tilts, seconds, map_T_middle, range_noise, span : as for :meth:`ToldVelocity.of`
     twist : (6,) rad/s and m/s, with which the sweep was de-skewed
     mean, missed : (6,) rad/s and m/s, the mean velocity since the last sweep and the standard
         deviation of its difference from that in the middle
     heed_contradiction : whether the matches may contradict the mean velocity by five sigma. Then it
         is less certain than ``missed``; else they are taken to be of a pose that has jumped
     """
-    step, seen = ToldVelocity.of(rows, tilts, seconds, map_T_middle, range_noise)
+    step, seen, _ = ToldVelocity.of(rows, tilts, seconds, map_T_middle, range_noise, span)
     believed = expected_information(missed)
     if heed_contradiction:
         away = twist + step - mean

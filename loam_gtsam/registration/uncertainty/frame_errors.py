@@ -13,7 +13,7 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.registration.solvers.sweep_velocity import expected_information
+from loam_gtsam.registration.uncertainty.missed_motion import missed_motion, rotation_is_known
 from loam_gtsam.types import FloatArray, MapUpdate, SweepMotion
 
 _PAUSE = 1.0
@@ -179,56 +179,12 @@ class FrameErrors:
         self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None
     ) -> FloatArray:
         """(6, 6) covariance of what the motion of the sweep misses until the reference time."""
-        # Times the acceleration: what the points of the sweep draw its pose by, and how far an arc
-        # is from its chord, between the last two middles, at the reference time.
-        missed, noise = np.diag(motion.missed(steady=sweep.acceleration is None)), np.zeros(6)
-        drawn, chord, beyond = np.zeros((6, 6)), 0.0, np.zeros((6, 6))
+        interval, noise = 0.0, np.zeros(6)
         if self._last is not None and sweep.stamp > self._last.stamp:
             interval = (sweep.stamp - self._last.stamp) * 1e-9
-            seconds, faster = unresolved(interval, sweep.duration)
-            missed = faster**2 * missed
-            chord = 0.5 * sweep.middle * (seconds - sweep.middle)
-            if scan is not None:
-                drawn = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
-                if scan.of_velocity.any() and motion.next is not None:
-                    unexpected = 0.5 * interval * np.sqrt(motion.next.variances)
-                    believed = expected_information(unexpected)
-                    half = 0.5 * seconds
-                    missed = _left(half**2 * missed, believed, scan.of_velocity) / half**2
-                    bent = _by_jerk(scan, sweep, seconds)
-                    beyond = bent * (faster**3 * motion.jerks) @ bent.T
-        # Along one axis the two might cancel each other, which a stamp that is late does not.
-        least = sweep.duration**2 / 24.0
-        np.fill_diagonal(drawn, chord + np.maximum(np.diag(drawn), least))
-        if rotation_is_known(sweep):
-            missed[:3] = missed[:, :3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        covariance: FloatArray = drawn @ missed @ drawn.T + beyond + np.diag(noise)
-        return covariance
-
-
-def _by_jerk(scan: ScanError, sweep: MovingSweep, seconds: float) -> FloatArray:
-    """(6, 6) s^3, by which a jerk moves the pose at the reference time.
-
-    The path is taken for a parabola through the last middle, ``seconds`` ago.
-    """
-    bent = scan.by_jerk + seconds / 3.0 * scan.by_acceleration
-    least = sweep.middle**2 * (seconds - sweep.middle) / 6.0
-    np.fill_diagonal(bent, np.maximum(least, np.abs(np.diag(bent))))
-    return bent
-
-
-def _left(missed: FloatArray, believed: FloatArray, told: FloatArray) -> FloatArray:
-    """(6, 6) covariance of a velocity that was expected, and that matches have told.
-
-    The expected one misses it by the covariance ``missed`` (6, 6), and was believed by the
-    information ``believed`` (6, 6), beside that of the matches, ``told``.
-    """
-    both = np.linalg.inv(believed + told)
-    kept = both @ believed
-    left: FloatArray = kept @ missed @ kept.T + both @ told @ both
-    return left
+        return missed_motion(sweep, motion, interval, scan) + np.diag(noise)
 
 
 def _turned_unlike(
@@ -249,22 +205,6 @@ def _turned_unlike(
     to_reference = now.to_reference
     moved: FloatArray = to_reference @ (np.outer(bent, bent) + np.outer(led, led)) @ to_reference.T
     return moved
-
-
-def unresolved(seconds: float, duration: float) -> tuple[float, float]:
-    """The time in which a motion may change, and how much larger accelerations are in that.
-
-    Sweeps that follow each other after more ``seconds`` than one has (``duration``) do not show how
-    fast what sways between them does: it may do so within each of them.
-    """
-    if not 0.0 < duration < seconds:
-        return seconds, 1.0
-    return duration, (seconds / duration) ** 2
-
-
-def rotation_is_known(sweep: MovingSweep) -> bool:
-    """Whether an IMU has measured how a sweep turned."""
-    return sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
 
 
 def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from loam_gtsam.geometry import nearest_positive, symmetric
 from loam_gtsam.registration.odometry import ANYWHERE, Moment, Turns
 from loam_gtsam.registration.solvers import MotionFilter, MotionPrior, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.registration.uncertainty.frame_errors import rotation_is_known, unresolved
+from loam_gtsam.registration.uncertainty.missed_motion import rotation_is_known, unresolved
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import FloatArray
 

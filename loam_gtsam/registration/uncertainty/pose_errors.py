@@ -158,23 +158,18 @@ class PoseErrors:
             between=between,
             gyro=GyroNoise(self._gyro_noise, -sweep.middle) if by_gyro else None,
         )  # fmt: skip
-        return error and replace(error, of_velocity=self._of_velocity(solution, sweep))
+        return error and replace(error, told=self._told(solution, sweep))
 
-    def _of_velocity(self, solution: Solution, sweep: MovingSweep) -> FloatArray:
-        """(6, 6) information of the matches on the velocity in the middle of a sweep.
-
-        None if they had no say in it.
-        """
+    def _told(self, solution: Solution, sweep: MovingSweep) -> ToldVelocity | None:
+        """What the matches have told of the velocity in the middle; None if they had no say."""
         last, seen, config = self._frames.last, solution.localizability, self._config
         had_a_say = sweep.acceleration is not None and seen and tells_motion(seen, config.solver)
         if last is None or sweep.stamp <= last[0] or not had_a_say:
-            return np.zeros((6, 6))
+            return None
         rows, seconds = timed_rows(solution.matches, sweep, config.solver)
         span = max((sweep.stamp - last[0]) * 1e-9, sweep.duration)
-        seconds = seconds + seconds**2 / span  # the last middle stays on the path
         tilts, noise = solution.matches.tilts, config.features.range_noise
-        told = ToldVelocity.of(rows, tilts, seconds, solution.map_T_lidar, noise)
-        return told.information
+        return ToldVelocity.of(rows, tilts, seconds, solution.map_T_lidar, noise, span)
 
     def calibrated(
         self,

@@ -60,12 +60,13 @@ class Accelerations:
         self._window = window
         self._count = 0
         self._expected = expected
-        self._mean, self._raw, self._lasting = np.zeros((3, 6))
+        self._mean, self._raw, self._lasting, self._changed = np.zeros((4, 6))
         self._period = 0.0
         self._last: tuple[int, FloatArray] | None = None
         self._before: tuple[int, FloatArray] | None = None  # the last acceleration, noise and all
         self._first = np.zeros(6)
-        self._latest = np.zeros((2, 6))  # the last square, and that of what was not expected
+        # The last square, that of what was not expected, and that of the change
+        self._latest = np.zeros((3, 6))
 
     @property
     def variances(self) -> FloatArray:
@@ -73,17 +74,19 @@ class Accelerations:
         variances: FloatArray = np.maximum(self._mean, 0.0)
         return variances if self.known else np.maximum(variances, self._expected)
 
-    def missed(self, *, steady: bool) -> FloatArray:
+    def missed(self, *, steady: bool, faster: float = 1.0) -> FloatArray:
         """(6,) (rad/s^2)^2 and (m/s^2)^2 that a sweep was not de-skewed for.
 
         A ``steady`` velocity was, or else the :class:`Expected` acceleration. If a motion has just
-        begun, the last one counts alone.
+        begun, the last one counts alone. ``faster`` is by how much they may exceed second
+        differences of poses, if sweeps are farther apart than they are long.
         """
         usual, latest = self.variances, self._latest[0]
         if not steady:
             usual, latest = self._unexpected, self._latest[1]
         begun, later = latest > _BEGUN**2 * usual, 1.0 if steady else _LATER**2
-        return np.where(begun, latest, later * self._faster**4 * usual)
+        larger = np.maximum(self._faster, faster) ** 2
+        return np.where(begun, faster**2 * latest, later * larger * usual)
 
     @property
     def at_first(self) -> FloatArray:
@@ -100,7 +103,7 @@ class Accelerations:
         """What is expected of the next acceleration; None at first."""
         if not self.known or self._last is None:
             return None
-        variances = np.minimum(self._faster**4 * self._unexpected, self._expected)
+        variances = np.minimum(self._faster**2 * self._unexpected, self._expected)
         return Expected(*self._last, self._share, _USUAL * np.sqrt(self._raw), variances)
 
     @property
@@ -120,21 +123,20 @@ class Accelerations:
         unexpected: FloatArray = np.maximum(self.variances - self._share**2 * self._raw, 0.0)
         return unexpected
 
-    @property
-    def jerks(self) -> FloatArray:
-        """(6,) (rad/s^3)^2 and (m/s^3)^2, mean squares."""
-        return self._changes * self._faster**6 / max(self._period, _SHORTEST) ** 2
+    def jerks(self, faster: float = 1.0) -> FloatArray:
+        """(6,) (rad/s^3)^2 and (m/s^3)^2, mean squares; the last one if a motion has just begun.
 
-    @property
-    def _changes(self) -> FloatArray:
-        """(6,) (rad/s^2)^2 and (m/s^2)^2, mean squares of the change of the acceleration."""
-        # A third difference has the errors of four poses, with weights 1, -3, 3, -1.
-        noise = 20.0 / 6.0 * (self._raw - self._mean)
-        return np.maximum(2.0 * (self._raw - self._lasting) - noise, 0.0)
+        ``faster`` as for :meth:`missed`.
+        """
+        usual, latest = np.maximum(self._changed, 0.0), self._latest[2]
+        begun, larger = latest > _BEGUN**2 * usual, np.maximum(self._faster, faster) ** 3
+        changes = np.where(begun, faster**3 * latest, larger * usual)
+        jerks: FloatArray = changes / max(self._period, _SHORTEST) ** 2
+        return jerks
 
     @property
     def _faster(self) -> FloatArray:
-        """(6,) the root of by how much accelerations exceed second differences of the poses.
+        """(6,) by how much accelerations exceed second differences of the poses.
 
         As for a sine whose third differences are as these: that of the frequency f over the period
         T has 2 sin(pi f T) times the second ones, and these have (sin(pi f T) / pi f T)^2 of the
@@ -142,9 +144,10 @@ class Accelerations:
         """
         if not self.known:
             return np.ones(6)
-        ratio = self._changes / np.maximum(self._mean, np.finfo(float).tiny)
+        ratio = np.maximum(self._changed, 0.0) / np.maximum(self._mean, np.finfo(float).tiny)
         sine = np.clip(0.5 * np.sqrt(ratio), _SLOWEST, 1.0)
-        return np.arcsin(sine) / sine
+        faster: FloatArray = (np.arcsin(sine) / sine) ** 2
+        return faster
 
     def explains(self, step: FloatArray, stamp: int) -> bool:
         """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.
@@ -178,10 +181,14 @@ class Accelerations:
         squared = acceleration**2
         if self._count <= _KNOWN:
             self._first = self._first + gain * (squared - self._first)
-        known = np.zeros(6)
+        known, changed = np.zeros(6), np.zeros(6)
         if previous is not None and previous[0] == last_stamp:
             known = self._share * previous[1]
             self._lasting = self._lasting + gain * (acceleration * previous[1] - self._lasting)
-        self._latest = np.stack([squared, (acceleration - known) ** 2]) - noise
+            # A third difference has those of four, with weights 1, -3, 3, -1.
+            changed = (acceleration - previous[1]) ** 2 - 20.0 / 6.0 * noise
+            self._changed = self._changed + gain * (changed - self._changed)
+        unexpected = (acceleration - known) ** 2 - noise
+        self._latest = np.stack([squared - noise, unexpected, changed])
         self._raw = self._raw + gain * (squared - self._raw)
         self._mean = self._mean + gain * (squared - noise - self._mean)

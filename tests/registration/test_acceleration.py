@@ -54,7 +54,7 @@ def test_accelerations_of_a_fast_sway_are_larger_than_second_differences(hertz):
     rate, drive = 2.0 * np.pi * hertz, along(3, lambda t: 0.02 * np.sin(2.0 * np.pi * hertz * t))
     known = of_path(drive)[0]
     assert known.missed(steady=True)[3] == pytest.approx((0.02 * rate**2) ** 2 / 2.0, rel=0.35)
-    assert known.jerks[3] == pytest.approx((0.02 * rate**3) ** 2 / 2.0, rel=0.5)
+    assert known.jerks()[3] == pytest.approx((0.02 * rate**3) ** 2 / 2.0, rel=0.5)
     shown = (np.sin(0.05 * rate) / (0.05 * rate)) ** 4
     assert known.variances[3] / known.missed(steady=True)[3] == pytest.approx(shown, rel=0.2)
 

@@ -23,14 +23,15 @@ def missed_motion(
     scan : None if an IMU has led to the middle
     """
     seconds, faster = unresolved(interval, sweep.duration)
-    accelerations = faster**2 * np.diag(motion.missed(steady=sweep.acceleration is None))
+    steady = sweep.acceleration is None
+    accelerations = np.diag(motion.missed(steady=steady, faster=faster))
     drawn, curved = by_acceleration(sweep, seconds, scan), np.zeros((6, 6))
     if interval and scan is not None and scan.told is not None and motion.next is not None:
         half = 0.5 * seconds  # times the acceleration, by which it changes the velocity
         believed = expected_information(0.5 * interval * np.sqrt(motion.next.variances))
         accelerations = scan.told.left(half**2 * accelerations, believed) / half**2
         bent = by_jerk(sweep, seconds, scan, drawn @ scan.told.bent(believed) / half)
-        curved = bent * (faster**3 * motion.jerks) @ bent.T
+        curved = bent * motion.jerks(faster) @ bent.T
     if rotation_is_known(sweep):
         accelerations[:3] = accelerations[:, :3] = 0.0
     covariance: FloatArray = drawn @ accelerations @ drawn.T + curved

@@ -144,8 +144,10 @@ class Accelerations:
         """
         if not self.known:
             return np.ones(6)
-        ratio = np.maximum(self._changed, 0.0) / np.maximum(self._mean, np.finfo(float).tiny)
-        sine = np.clip(0.5 * np.sqrt(ratio), _SLOWEST, 1.0)
+        third = np.maximum(self._changed, 0.0)
+        second = np.maximum(self._mean, 0.25 * third)
+        sine = np.sqrt(0.25 * third / np.maximum(second, np.finfo(float).tiny))
+        sine = np.clip(sine, _SLOWEST, 1.0)
         faster: FloatArray = (np.arcsin(sine) / sine) ** 2
         return faster
 

@@ -59,6 +59,21 @@ def test_accelerations_of_a_fast_sway_are_larger_than_second_differences(hertz):
     assert known.variances[3] / known.missed(steady=True)[3] == pytest.approx(shown, rel=0.2)
 
 
+def test_what_sweeps_far_apart_may_hide_stands_for_what_a_fast_sway_hides():
+    known, _ = of_path(along(3, lambda t: 0.02 * np.sin(2.0 * np.pi * 3.5 * t)))
+    hidden = known.missed(steady=True, faster=25.0)
+    np.testing.assert_allclose(hidden, 25.0**2 * known.variances)
+    larger = known.missed(steady=True)[3] / known.variances[3]
+    assert known.jerks(25.0)[3] == pytest.approx(25.0**3 / larger**1.5 * known.jerks()[3])
+
+
+def test_a_jerk_that_has_just_begun_counts_in_full():
+    begins = (STEPS - 2) * PERIOD
+    known, _ = of_path(along(3, lambda t: 1.5 * max(t - begins, 0.0) ** 2))
+    assert known.jerks()[3] == pytest.approx((1.5 / PERIOD) ** 2)
+    assert known.jerks(4.0)[3] == pytest.approx(4.0**3 * (1.5 / PERIOD) ** 2)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_of_noise_nothing_is_expected(seed):
     known, _ = of_path(lambda _: np.zeros(6), sigma=0.01, seed=seed)

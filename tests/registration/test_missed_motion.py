@@ -45,7 +45,7 @@ def turning_lidar(middle):
         bread @ (jacobian.T * by @ jacobian) for by in (seconds, seconds**2 / 2.0, seconds**3 / 6.0)
     )
     none = np.zeros((6, 6))
-    told = ToldVelocity.of(rows, np.zeros(4000), seconds, gtsam.Pose3(), 0.0, SPAN)
+    told = ToldVelocity.of(rows, np.zeros(4000), seconds, gtsam.Pose3(), 0.0, SPAN, with_jerk=True)
     scan = ScanError(*[none] * 6, np.zeros(6), 1.0, 10.0, *ways, told=told)
     sweep = SimpleNamespace(middle=middle, duration=SPAN)
     return sweep, scan, jacobian, seconds

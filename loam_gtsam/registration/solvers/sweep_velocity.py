@@ -45,7 +45,7 @@ class ToldVelocity(NamedTuple):
     ----------
     step : (6,) rad/s and m/s, the change of the velocity that they want
     information : (6, 6) of it, as far as it can be believed
-    by_jerk : (6, 6) s^2, by which a jerk changes that step
+    by_jerk : (6, 6) s^2, by which a jerk changes that step; zero if it was not asked for
     """
 
     step: FloatArray
@@ -55,7 +55,7 @@ class ToldVelocity(NamedTuple):
     @classmethod
     def of(
         cls, rows: MatchRows, tilts: FloatArray, seconds: FloatArray, map_T_middle: gtsam.Pose3,
-        range_noise: float, span: float = np.inf,
+        range_noise: float, span: float = np.inf, *, with_jerk: bool = False,
     ) -> ToldVelocity:  # fmt: skip
         """Of the matches of a sweep at a pose.
 
@@ -73,6 +73,7 @@ class ToldVelocity(NamedTuple):
         map_T_middle : the solved pose
         range_noise : metres, of a single range
         span : seconds since the last middle; infinite if it is not on the path
+        with_jerk : whether ``by_jerk`` is asked for, with a finite span
         """
         residuals, by_pose = rows.residuals(map_T_middle)
         moved = seconds + seconds**2 / span
@@ -84,7 +85,7 @@ class ToldVelocity(NamedTuple):
         alone = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
         step = alone @ (pull[6:] - followed @ pull[:6])
         by_jerk = np.zeros((6, 6))
-        if np.isfinite(span):
+        if with_jerk:
             bent = both.T @ (by_pose * ((seconds + span) * seconds**2 / 6.0)[:, None])
             by_jerk = alone @ (bent[6:] - followed @ bent[:6])
         noise = displacements(rows.points, (rows.scales * tilts * moved) ** 2)

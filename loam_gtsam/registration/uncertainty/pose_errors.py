@@ -169,7 +169,9 @@ class PoseErrors:
         rows, seconds = timed_rows(solution.matches, sweep, config.solver)
         span = max((sweep.stamp - last[0]) * 1e-9, sweep.duration)
         tilts, noise = solution.matches.tilts, config.features.range_noise
-        return ToldVelocity.of(rows, tilts, seconds, solution.map_T_lidar, noise, span)
+        return ToldVelocity.of(
+            rows, tilts, seconds, solution.map_T_lidar, noise, span, with_jerk=True
+        )
 
     def calibrated(
         self,

@@ -234,7 +234,7 @@ def test_every_fault_of_the_soak_is_injected_and_counted(
     tmp_path: Path, here: pytest.MonkeyPatch
 ) -> None:
     here.setattr(soak, "QUICK", 160)
-    here.setitem(soak.SCENES, "street_loop", 200)
+    here.setitem(soak.SCENES, "street_loop", 300)
     kept: list[soak.SoakResult] = []
     run = soak.soak
     here.setattr(soak, "soak", lambda *a: kept.append(run(*a)) or kept[-1])
